@@ -1,0 +1,57 @@
+//! Running other programs, from the workspace's root.
+
+use std::ffi::OsStr;
+use std::path::PathBuf;
+use std::process::Command;
+
+use anyhow::{Context, bail};
+
+use crate::TARGET;
+
+/// Root of the workspace.
+pub fn root() -> PathBuf {
+    let manifest = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    manifest.parent().map_or(manifest.clone(), PathBuf::from)
+}
+
+/// A program, to be run from the root.
+pub fn program(name: impl AsRef<OsStr>) -> Command {
+    let mut command = Command::new(name);
+    command.current_dir(root());
+    command
+}
+
+/// The cargo that runs this task, with its arguments.
+pub fn cargo(arguments: &str) -> Command {
+    let mut command = program(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.args(arguments.split_whitespace());
+    command
+}
+
+/// Says what is done, does it, and fails with the command's name if it fails.
+pub fn step(title: &str, command: &mut Command) -> anyhow::Result<()> {
+    announce(title);
+    let status =
+        command.status().with_context(|| format!("{title}: cannot run {:?}", command.get_program()))?;
+    if !status.success() {
+        bail!("{title}: {command:?} failed with {status}");
+    }
+    Ok(())
+}
+
+/// A headline for what follows.
+pub fn announce(title: &str) {
+    println!("\n==> {title}");
+}
+
+/// Adds the firmware's target to the toolchain if it is not there.
+pub fn ensure_target() -> anyhow::Result<()> {
+    let installed = program("rustup")
+        .args(["target", "list", "--installed"])
+        .output()
+        .context("rustup is needed to see which targets are installed")?;
+    if String::from_utf8_lossy(&installed.stdout).lines().any(|line| line.trim() == TARGET) {
+        return Ok(());
+    }
+    step(&format!("install target {TARGET}"), program("rustup").args(["target", "add", TARGET]))
+}

@@ -1,0 +1,119 @@
+//! `cargo xtask test`: everything CI runs.
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, bail};
+
+use crate::TARGET;
+use crate::run::{announce, cargo, ensure_target, program, root, step};
+
+/// Runs every check, cheapest first; the tests come last and close with their sum.
+pub fn everything() -> anyhow::Result<()> {
+    ensure_target()?;
+    step("format", &mut cargo("fmt --all --check"))?;
+    step("clippy, host", &mut cargo("clippy --workspace --all-targets -- -D warnings"))?;
+    let features = "slam-core/defmt,slam-core/serde";
+    for arguments in ["", "--features defmt,serde"] {
+        let command = format!("clippy -p slam-core --target {TARGET} {arguments} -- -D warnings");
+        step(&format!("clippy, slam-core for {TARGET} {arguments}"), &mut cargo(&command))?;
+    }
+    let mut docs = cargo(&format!("doc --workspace --no-deps --features {features}"));
+    step("docs", docs.env("RUSTDOCFLAGS", "-D warnings"))?;
+    let python = referee_python();
+    tests(python)
+}
+
+/// Runs all tests and adds up what the test runner says.
+fn tests(python: Option<PathBuf>) -> anyhow::Result<()> {
+    announce("tests");
+    let mut command = cargo("test --workspace --no-fail-fast");
+    if let Some(python) = python {
+        command.env("LINESLAM_PYTHON", python);
+    }
+    let mut child = command.stdout(Stdio::piped()).spawn().context("cannot run cargo test")?;
+    let mut sum = Sum::default();
+    let mut out = std::io::stdout();
+    for line in BufReader::new(child.stdout.take().context("the tests' output")?).lines() {
+        let line = line.context("the tests' output")?;
+        writeln!(out, "{line}")?;
+        sum.take(&line);
+    }
+    let status = child.wait()?;
+    println!();
+    for skipped in &sum.skipped {
+        println!("{skipped}");
+    }
+    println!("{} passed, {} failed, {} skipped", sum.passed, sum.failed, sum.skipped.len());
+    if !status.success() || sum.failed > 0 {
+        bail!("tests failed");
+    }
+    if sum.passed == 0 {
+        bail!("no test ran");
+    }
+    Ok(())
+}
+
+#[derive(Default)]
+struct Sum {
+    passed: usize,
+    failed: usize,
+    skipped: Vec<String>,
+}
+
+impl Sum {
+    fn take(&mut self, line: &str) {
+        if line.starts_with("SKIPPED ") {
+            self.skipped.push(line.to_owned());
+        }
+        // test result: ok. 14 passed; 0 failed; …
+        let Some(counts) =
+            line.strip_prefix("test result: ").and_then(|l| l.split_once(". ")).map(|(_, c)| c)
+        else {
+            return;
+        };
+        for part in counts.split("; ") {
+            match part.split_once(' ') {
+                Some((n, "passed")) => self.passed += n.parse().unwrap_or(0),
+                Some((n, "failed")) => self.failed += n.parse().unwrap_or(0),
+                _ => {}
+            }
+        }
+    }
+}
+
+/// A Python with what the referee beside the recorded logs needs, made once in the target folder. Without the referee, or
+/// where it cannot be made, `None`: its test then says that it was skipped.
+fn referee_python() -> Option<PathBuf> {
+    if !root().join("../shared/referee/score.py").exists() {
+        return None;
+    }
+    let folder = root().join("target/referee-python");
+    let python = folder.join("bin/python3");
+    let works = |python: &PathBuf| {
+        Command::new(python)
+            .args(["-c", "import numpy, scipy"])
+            .stderr(Stdio::null())
+            .status()
+            .is_ok_and(|s| s.success())
+    };
+    if works(&python) {
+        return Some(python);
+    }
+    let made =
+        step("Python for the referee", program("python3").args(["-m", "venv"]).arg(&folder)).and_then(|()| {
+            step(
+                "numpy and scipy",
+                program(&python).args(["-m", "pip", "install", "--quiet", "numpy", "scipy"]),
+            )
+        });
+    match made {
+        Ok(()) if works(&python) => Some(python),
+        Ok(()) => None,
+        Err(error) => {
+            eprintln!("{error:#}");
+            None
+        }
+    }
+}
