@@ -1,0 +1,525 @@
+//! The pose that makes pairs of segments agree.
+//!
+//! In: observed segments in `base`, their pairs in the map, the predicted pose with its covariance. Out: the corrected
+//! pose with covariance, and how well each direction of the pose is seen.
+//!
+//! [`least_squares`] is the paper's: equations (3)–(9), solved once, no prior; a singular system leaves the pose alone.
+//! [`maximum_a_posteriori`] is one Gauss-Newton step of the default: the odometry is a prior, each pair weighs by its
+//! lines' covariances, a robust kernel turns down pairs that do not fit, and information that is only an artefact of
+//! uncertain line directions is taken out (see [`Observability`]).
+
+use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
+
+use crate::association::Pair;
+use crate::map::MapSegment;
+use crate::math::sqrt;
+use crate::pose::{components, perpendicular, pose};
+use crate::residual::{LineNoise, Residual};
+use crate::segment::Segment;
+
+/// How the pose is corrected.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
+pub enum CorrectionConfig {
+    /// Equations (3)–(9) of the paper.
+    LeastSquares,
+    /// Maximum a posteriori, iterated with re-association.
+    MaximumAPosteriori(MapConfig),
+}
+
+/// Settings of the maximum-a-posteriori correction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct MapConfig {
+    /// Most rounds of association and step.
+    pub max_iterations: u8,
+    /// A step shorter than this ends the rounds, metres and radians alike.
+    pub converged_step: f32,
+    /// Scale of the Cauchy kernel: a pair of this χ² keeps half its weight.
+    pub kernel_chi2: f32,
+    /// Directions of lines are not trusted beyond this, radians: translation information across nearly parallel
+    /// lines that so small an error would explain is not used.
+    pub direction_trust_rad: f32,
+    /// A direction is called observable when the lines alone fix it better than this, metres.
+    pub observable_sigma_m: f32,
+    /// Search for a better start.
+    pub search: SearchConfig,
+}
+
+/// Settings of the search for another heading where little of a scan was recognised.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct SearchConfig {
+    /// The search is made when less than this share of the scan was recognised.
+    pub below_support: f32,
+    /// Share of the scan that must be recognised more for another heading to be taken.
+    pub gain: f32,
+    /// Distance between the headings tried, radians.
+    pub step_rad: f32,
+    /// How far they reach to each side, radians.
+    pub reach_rad: f32,
+}
+
+/// Which directions of the pose the pairs fix.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observability {
+    /// Eigenvalues of the pairs' normal matrix over (x, y, θ·1 m), ascending, 1/m². The prior is not in it.
+    pub eigenvalues: [f32; 3],
+    /// Unit direction in `map` along which translation is seen worst.
+    pub weak_direction: Vector2<f32>,
+    /// Standard deviation along that direction from the pairs alone, metres; infinite when they say nothing.
+    pub weak_sigma_m: f32,
+    /// The judgement.
+    pub verdict: Verdict,
+}
+
+/// Judgement of an [`Observability`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Verdict {
+    /// Position and heading are fixed by the pairs.
+    Full,
+    /// Heading and one direction are; along the other the odometry decides.
+    Corridor,
+    /// No pair: the odometry decides everything.
+    Blind,
+}
+
+impl Observability {
+    /// Nothing seen.
+    pub const BLIND: Self = Self {
+        eigenvalues: [0.0; 3],
+        weak_direction: Vector2::new(1.0, 0.0),
+        weak_sigma_m: f32::INFINITY,
+        verdict: Verdict::Blind,
+    };
+}
+
+/// Outcome of one correction step.
+#[derive(Clone, Copy, Debug)]
+pub struct Correction {
+    /// Corrected pose of `base` in `map`.
+    pub pose: Isometry2<f32>,
+    /// Its covariance (x, y, θ) in `map`.
+    pub covariance: Matrix3<f32>,
+    /// Larger of the steps in position (m) and heading (rad).
+    pub step: f32,
+    /// Directions the pairs fix.
+    pub observability: Observability,
+}
+
+/// Predicted pose and covariance: where the correction starts and what it is drawn to.
+#[derive(Clone, Copy, Debug)]
+pub struct Prior {
+    /// Pose of `base` in `map`.
+    pub pose: Isometry2<f32>,
+    /// Covariance (x, y, θ) in `map`.
+    pub covariance: Matrix3<f32>,
+}
+
+/// Equations (3)–(9): one linear least-squares step on the end points of the observed segments.
+///
+/// `None` when the system is singular. The paper gives no covariance; here it is that of points of variance
+/// `variance_m2`, n of them for each segment.
+pub fn least_squares(
+    observed: &[Segment],
+    pairs: &[Pair],
+    map: &[MapSegment],
+    predicted: &Isometry2<f32>,
+    variance_m2: f32,
+) -> Option<Correction> {
+    let centre = predicted.translation.vector;
+    let (mut normal_matrix, mut right) = (Matrix3::<f32>::zeros(), Vector3::<f32>::zeros());
+    for pair in pairs {
+        let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get(pair.mapped)) else { continue };
+        let seen = seen.transformed(predicted);
+        let line = entry.segment.line();
+        let (u, n) = (line.normal, seen.moments.inliers as f32);
+        for p in [seen.start, seen.end] {
+            let turned = perpendicular(p.coords - centre).dot(&u); // M(p − c)·u
+            let gap = line.distance_m - p.coords.dot(&u); // b − p·u
+            let row = Vector3::new(u.x, u.y, turned);
+            normal_matrix += row * row.transpose() * n; // A, B, D
+            right += row * (n * gap); // E, F
+        }
+    }
+    // Eq. (9). A system is called singular where f32 could not solve it to a digit.
+    let [least, _, most] = sorted_eigenvalues(&normal_matrix);
+    if least.is_nan() || least <= 1e-5 * most {
+        return None;
+    }
+    let inverse = normal_matrix.cholesky()?.inverse();
+    let step = inverse * right;
+    let c = components(predicted);
+    let corrected = pose(c.x + step.x, c.y + step.y, c.z + step.z);
+    // Each point was counted at both ends.
+    let observability = judge(&(normal_matrix / (2.0 * variance_m2)), 0.0, f32::INFINITY);
+    let covariance = inverse * (2.0 * variance_m2);
+    finite(Correction { pose: corrected, covariance, step: largest(&step), observability })
+}
+
+/// One Gauss-Newton step towards the pose of largest posterior probability, from `at`.
+///
+/// `None` when the numbers do not allow a step (a prior that is not positive definite, infinities). Work: one step
+/// for each pair.
+pub fn maximum_a_posteriori(
+    observed: &[Segment],
+    pairs: &[Pair],
+    map: &[MapSegment],
+    prior: &Prior,
+    at: &Isometry2<f32>,
+    line_noise: &LineNoise,
+    config: &MapConfig,
+) -> Option<Correction> {
+    let (information, gradient) = pair_sums(observed, pairs, map, at, line_noise, config);
+    let observability = judge(&information, config.direction_trust_rad, config.observable_sigma_m);
+    let trust = trusted_projection(&information, &observability, config);
+    let prior_information = prior.covariance.cholesky()?.inverse();
+    let (from, to) = (components(at), components(&prior.pose));
+    let mut drawn = to - from;
+    drawn.z = crate::math::wrap_angle(drawn.z);
+    let total = trust * information * trust + prior_information;
+    let covariance = total.cholesky()?.inverse();
+    let step = covariance * (trust * gradient + prior_information * drawn);
+    let corrected = pose(from.x + step.x, from.y + step.y, from.z + step.z);
+    finite(Correction { pose: corrected, covariance, step: largest(&step), observability })
+}
+
+/// Normal matrix and right-hand side of the pairs, each weighed by its lines' covariance and the Cauchy kernel.
+fn pair_sums(
+    observed: &[Segment],
+    pairs: &[Pair],
+    map: &[MapSegment],
+    at: &Isometry2<f32>,
+    line_noise: &LineNoise,
+    config: &MapConfig,
+) -> (Matrix3<f32>, Vector3<f32>) {
+    let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
+    for pair in pairs {
+        let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get(pair.mapped)) else { continue };
+        let seen = seen.transformed(at);
+        let Some(residual) = Residual::new(&seen, &entry.segment, at.translation.vector.into(), line_noise)
+        else {
+            continue;
+        };
+        let Some(weight) = residual.information() else { continue };
+        let chi2 = residual.error.dot(&(weight * residual.error));
+        let kept = weight / (1.0 + chi2 / config.kernel_chi2);
+        let weighed = residual.jacobian.transpose() * kept;
+        information += weighed * residual.jacobian;
+        gradient -= weighed * residual.error;
+    }
+    (information, gradient)
+}
+
+/// Information about translation once the heading is free: Schur complement of the normal matrix.
+fn translation_information(information: &Matrix3<f32>) -> Matrix2<f32> {
+    let coupling = Vector2::new(information.m13, information.m23);
+    let translation = information.fixed_view::<2, 2>(0, 0).into_owned();
+    if information.m33 > 0.0 {
+        translation - coupling * coupling.transpose() / information.m33
+    } else {
+        translation
+    }
+}
+
+/// What a normal matrix says of each direction; see [`MapConfig`] for the two limits.
+fn judge(information: &Matrix3<f32>, direction_trust_rad: f32, observable_sigma_m: f32) -> Observability {
+    let eigenvalues = sorted_eigenvalues(information);
+    let [_, _, most] = eigenvalues;
+    if most.is_nan() || most <= 0.0 {
+        return Observability::BLIND;
+    }
+    let [(strong, _), (weak, weak_direction)] = eigen2(&translation_information(information));
+    let usable = usable_information(weak, strong, direction_trust_rad);
+    let weak_sigma_m = if usable > 0.0 { 1.0 / sqrt(usable) } else { f32::INFINITY };
+    let verdict = if weak_sigma_m <= observable_sigma_m { Verdict::Full } else { Verdict::Corridor };
+    Observability { eigenvalues, weak_direction, weak_sigma_m, verdict }
+}
+
+/// What remains of the weak direction's information when that which uncertain line directions explain is taken out.
+fn usable_information(weak: f32, strong: f32, direction_trust_rad: f32) -> f32 {
+    (weak - direction_trust_rad * direction_trust_rad * strong).max(0.0)
+}
+
+/// The matrix T that turns the pairs' Jacobian J into J·T, so that the weak direction keeps its usable information only.
+fn trusted_projection(information: &Matrix3<f32>, seen: &Observability, config: &MapConfig) -> Matrix3<f32> {
+    let [(strong, _), (weak, _)] = eigen2(&translation_information(information));
+    let share =
+        if weak > 0.0 { usable_information(weak, strong, config.direction_trust_rad) / weak } else { 0.0 };
+    let v = seen.weak_direction;
+    let off = 1.0 - sqrt(share);
+    Matrix3::new(
+        1.0 - off * v.x * v.x,
+        -off * v.x * v.y,
+        0.0,
+        -off * v.x * v.y,
+        1.0 - off * v.y * v.y,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
+}
+
+/// Eigenvalues and unit eigenvectors of a symmetric matrix, the larger first.
+fn eigen2(m: &Matrix2<f32>) -> [(f32, Vector2<f32>); 2] {
+    let scatter =
+        crate::segment::Moments { scatter: [m.m11, m.m12, m.m22], ..crate::segment::Moments::EMPTY };
+    let strong = scatter.direction();
+    let weak = perpendicular(strong);
+    [(scatter.scatter_along(strong), strong), (scatter.scatter_along(weak), weak)]
+}
+
+fn sorted_eigenvalues(m: &Matrix3<f32>) -> [f32; 3] {
+    if !m.iter().all(|v| v.is_finite()) {
+        return [0.0; 3];
+    }
+    let values = nalgebra::SymmetricEigen::try_new(*m, f32::EPSILON, 50).map(|e| e.eigenvalues);
+    let mut sorted = values.map_or([0.0; 3], |v| [v.x, v.y, v.z]);
+    sorted.sort_unstable_by(f32::total_cmp);
+    sorted
+}
+
+fn largest(step: &Vector3<f32>) -> f32 {
+    step.x.abs().max(step.y.abs()).max(step.z.abs())
+}
+
+fn finite(correction: Correction) -> Option<Correction> {
+    let covariance_is_finite = correction.covariance.iter().all(|v| v.is_finite());
+    (crate::pose::is_finite(&correction.pose) && covariance_is_finite).then_some(correction)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::segment::Moments;
+    use nalgebra::Point2;
+    use proptest::prelude::*;
+    use std::vec::Vec;
+
+    const NOISE: LineNoise = LineNoise { sigma_offset_m: 0.005, sigma_direction_rad: 0.002 };
+
+    fn config() -> MapConfig {
+        match crate::SlamConfig::default().correction {
+            CorrectionConfig::MaximumAPosteriori(config) => config,
+            CorrectionConfig::LeastSquares => unreachable!("the default is maximum a posteriori"),
+        }
+    }
+
+    fn wall(from: (f32, f32), to: (f32, f32), points: usize) -> Segment {
+        let at = |i: usize| {
+            let share = i as f32 / (points - 1) as f32;
+            Point2::new(from.0 + share * (to.0 - from.0), from.1 + share * (to.1 - from.1))
+        };
+        let moments = Moments::from_points((0..points).map(|i| (at(i), 1e4)));
+        Segment::fitted(moments, &[at(0), at(points - 1)], Point2::origin())
+    }
+
+    /// A room around the origin: every wall faces it.
+    fn room() -> Vec<Segment> {
+        [
+            wall((3.0, -2.0), (3.0, 2.5), 60),
+            wall((3.0, 2.5), (-2.0, 2.5), 70),
+            wall((-2.0, 2.5), (-2.0, -2.0), 50),
+            wall((-2.0, -2.0), (1.0, -2.0), 40),
+        ]
+        .to_vec()
+    }
+
+    fn entries(walls: &[Segment]) -> Vec<MapSegment> {
+        walls.iter().map(|&segment| MapSegment { segment, hits: 5, last_seen: 1, seen_at_m: 0.0 }).collect()
+    }
+
+    fn all_pairs(n: usize) -> Vec<Pair> {
+        (0..n).map(|i| Pair { observed: i, mapped: i }).collect()
+    }
+
+    /// The same least squares in f64 over the end points, by numeric differentiation of the cost of eq. (3).
+    fn reference_step(observed: &[Segment], map: &[MapSegment], predicted: [f64; 3]) -> [f64; 3] {
+        let residuals = |d: [f64; 3]| {
+            let mut all = Vec::new();
+            for (seen, entry) in observed.iter().zip(map) {
+                let line = entry.segment.line();
+                let (ux, uy, b) =
+                    (f64::from(line.normal.x), f64::from(line.normal.y), f64::from(line.distance_m));
+                for end in [seen.start, seen.end] {
+                    let (s, c) = predicted[2].sin_cos();
+                    let (ex, ey) = (f64::from(end.x), f64::from(end.y));
+                    // p − c, then R(Δθ) made linear.
+                    let (px, py) = (c * ex - s * ey, s * ex + c * ey);
+                    let (qx, qy) =
+                        (px - d[2] * py + predicted[0] + d[0], py + d[2] * px + predicted[1] + d[1]);
+                    all.push(f64::from(seen.moments.inliers).sqrt() * (qx * ux + qy * uy - b));
+                }
+            }
+            nalgebra::SVector::<f64, 8>::from_iterator(all)
+        };
+        let at = residuals([0.0; 3]);
+        let h = 1e-4;
+        let columns = [0, 1, 2].map(|k| {
+            let mut d = [0.0; 3];
+            d[k] = h;
+            (residuals(d) - at) / h
+        });
+        let jacobian = nalgebra::SMatrix::<f64, 8, 3>::from_columns(&columns);
+        let step = (jacobian.transpose() * jacobian).try_inverse().unwrap() * (jacobian.transpose() * -at);
+        [step[0], step[1], step[2]]
+    }
+
+    proptest! {
+        #[test]
+        fn paper_step_is_the_least_squares_of_equation_3(
+            x in -0.3f32..0.3, y in -0.3f32..0.3, a in -0.2f32..0.2, px in -5.0f32..5.0, pa in -3.1f32..3.1
+        ) {
+            // The robot stands at `truth` in a room that is carried along; the prediction is off by (x, y, a).
+            let truth = pose(px, 1.0, pa);
+            let observed = room();
+            let map = entries(&observed.iter().map(|s| s.transformed(&truth)).collect::<Vec<_>>());
+            let c = components(&truth);
+            let predicted = pose(c.x + x, c.y + y, c.z + a);
+            let got = least_squares(&observed, &all_pairs(4), &map, &predicted, 1e-4).unwrap();
+            let p = components(&predicted);
+            let want = reference_step(&observed, &map, [f64::from(p.x), f64::from(p.y), f64::from(p.z)]);
+            let moved = components(&got.pose) - p;
+            for (g, w) in [moved.x, moved.y, crate::math::wrap_angle(moved.z)].into_iter().zip(want) {
+                prop_assert!((f64::from(g) - w).abs() < 2e-4, "{} {}", g, w);
+            }
+        }
+
+        #[test]
+        fn map_steps_lead_to_the_true_pose(
+            x in -0.2f32..0.2, y in -0.2f32..0.2, a in -0.2f32..0.2, px in -50.0f32..50.0, pa in -3.1f32..3.1
+        ) {
+            let truth = pose(px, 1.0, pa);
+            let observed = room();
+            let map = entries(&observed.iter().map(|s| s.transformed(&truth)).collect::<Vec<_>>());
+            let c = components(&truth);
+            let prior = Prior {
+                pose: pose(c.x + x, c.y + y, c.z + a),
+                covariance: Matrix3::from_diagonal(&Vector3::new(10.0, 10.0, 10.0)),
+            };
+            let mut at = prior.pose;
+            for _ in 0..15 {
+                at = maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &at, &NOISE, &config()).unwrap().pose;
+            }
+            let off = truth.inverse() * at;
+            prop_assert!(off.translation.vector.norm() < 2e-3, "{}", off);
+            prop_assert!(crate::pose::heading(&off).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn no_pair_leaves_the_prior_as_it_is() {
+        let prior = Prior { pose: pose(1.0, 2.0, 3.0), covariance: Matrix3::identity() * 0.01 };
+        let got = maximum_a_posteriori(&[], &[], &[], &prior, &prior.pose, &NOISE, &config()).unwrap();
+        assert_eq!(got.observability.verdict, Verdict::Blind);
+        assert!((got.covariance - prior.covariance).norm() < 1e-6);
+        assert!((components(&got.pose) - components(&prior.pose)).norm() < 1e-6);
+        assert!(least_squares(&[], &[], &[], &prior.pose, 1e-4).is_none());
+    }
+
+    #[test]
+    fn one_wall_and_parallel_walls_are_singular_for_the_paper() {
+        let corridor = [wall((-3.0, 1.0), (3.0, 1.0), 50), wall((-3.0, -1.0), (3.0, -1.0), 50)];
+        let map = entries(&corridor);
+        for n in [1, 2] {
+            assert!(
+                least_squares(&corridor[..n], &all_pairs(n), &map, &pose(0.0, 0.1, 0.02), 1e-4).is_none()
+            );
+        }
+    }
+
+    #[test]
+    fn in_a_corridor_the_odometry_keeps_the_direction_along_it() {
+        // The walls' directions are a little off, as they are after any fit: a naive solver reads a position from that.
+        let observed = [wall((-3.0, 1.0), (3.0, 1.01), 50), wall((-3.0, -1.0), (3.0, -1.02), 50)];
+        let map = entries(&[wall((-3.0, 1.0), (3.0, 1.0), 50), wall((-3.0, -1.0), (3.0, -1.0), 50)]);
+        let prior = Prior {
+            pose: pose(0.30, 0.05, 0.02),
+            covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
+        };
+        let mut at = prior.pose;
+        let mut last = None;
+        for _ in 0..8 {
+            let step =
+                maximum_a_posteriori(&observed, &all_pairs(2), &map, &prior, &at, &NOISE, &config()).unwrap();
+            (at, last) = (step.pose, Some(step));
+        }
+        let (c, last) = (components(&at), last.unwrap());
+        assert_eq!(last.observability.verdict, Verdict::Corridor);
+        assert!(last.observability.weak_direction.x.abs() > 0.99);
+        assert!((c.x - 0.30).abs() < 0.01, "along the corridor the odometry decides, {c}");
+        assert!(c.y.abs() < 0.02 && c.z.abs() < 0.01, "across and in heading the walls do, {c}");
+        assert!(last.covariance.m11 > 0.9 * 0.04, "and the uncertainty says so");
+        assert!(last.covariance.m22 < 0.01 * 0.04);
+    }
+
+    #[test]
+    fn one_wrong_pair_hardly_moves_the_pose() {
+        let observed = room();
+        let mut walls = room();
+        // A wall mistaken for one half a metre behind it.
+        walls[0] = wall((3.5, -2.0), (3.5, 2.5), 60);
+        let map = entries(&walls);
+        let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() * 0.01 };
+        let mut at = prior.pose;
+        for _ in 0..8 {
+            at = maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &at, &NOISE, &config())
+                .unwrap()
+                .pose;
+        }
+        assert!(at.translation.vector.norm() < 0.03, "{at}");
+    }
+
+    /// The reported covariance is that of the estimates' scatter over random noise.
+    #[test]
+    fn covariance_matches_the_scatter() {
+        use rand_core::{Rng, SeedableRng};
+        let mut rng = rand_pcg::Pcg32::seed_from_u64(7);
+        let mut gauss = || (0..12).map(|_| rng.next_u32() as f32 / u32::MAX as f32).sum::<f32>() - 6.0;
+        let noise = LineNoise { sigma_offset_m: 0.0, sigma_direction_rad: 0.0 };
+        let map = entries(
+            &room()
+                .iter()
+                .map(|s| Segment { moments: s.moments.loosened(1e4, 1e4), ..*s })
+                .collect::<Vec<_>>(),
+        );
+        let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() };
+        let config = MapConfig { kernel_chi2: 1e9, direction_trust_rad: 0.0, ..config() };
+        let (mut sums, mut reported, runs) = ([0.0f32; 3], Matrix3::zeros(), 600);
+        for _ in 0..runs {
+            let observed: Vec<Segment> = room()
+                .iter()
+                .map(|s| {
+                    let n = s.moments.inliers as usize;
+                    let points: Vec<Point2<f32>> = (0..n)
+                        .map(|i| {
+                            s.start
+                                + (s.end - s.start) * (i as f32 / (n - 1) as f32)
+                                + s.normal() * (0.01 * gauss())
+                        })
+                        .collect();
+                    let moments = Moments::from_points(points.iter().map(|&p| (p, 1e4)));
+                    Segment::fitted(moments, &[points[0], points[n - 1]], Point2::origin())
+                })
+                .collect();
+            let mut at = prior.pose;
+            for _ in 0..4 {
+                let step = maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &at, &noise, &config)
+                    .unwrap();
+                (at, reported) = (step.pose, step.covariance);
+            }
+            let c = components(&at);
+            for (sum, v) in sums.iter_mut().zip(c.iter()) {
+                *sum += v * v / runs as f32;
+            }
+        }
+        for (scatter, said) in sums.into_iter().zip([reported.m11, reported.m22, reported.m33]) {
+            assert!((0.8..1.25).contains(&(scatter / said)), "scatter {scatter}, reported {said}");
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! Ranges to points: each beam is placed where the sensor was when that beam was taken.
+//!
+//! In: ranges in `laser`, the motion of the base during the sweep. Out: points in `base` as it stood at the middle
+//! beam, in beam order, obstacles only.
+//!
+//! Between two knots of the sweep (4 ms for a URG-04LX) the sensor's pose is interpolated linearly; at 3 rad/s that
+//! leaves less than 20 µrad of bearing error. The paper takes the scan as instantaneous.
+
+use heapless::VecView;
+use nalgebra::{Isometry2, Point2, Vector2};
+
+use crate::math::sin_cos;
+use crate::odometry_track::{SWEEP_KNOTS, ScanMotion};
+use crate::scan::{Reading, Scan, SensorConfig};
+
+/// How scans are turned into points.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct DeskewConfig {
+    /// Whether the motion during the sweep is undone.
+    pub enabled: bool,
+}
+
+/// An obstacle that one beam saw.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ScanPoint {
+    /// Where, in `base` at the middle beam, metres.
+    pub position: Point2<f32>,
+    /// Range measured, metres.
+    pub range_m: f32,
+    /// Index of the beam in the scan.
+    pub beam: u16,
+}
+
+/// What became of the beams.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct DeskewReport {
+    /// Beams with a distance.
+    pub points: u32,
+    /// Beams that saw nothing in range.
+    pub no_echo: u32,
+    /// Beams with an error code.
+    pub bad: u32,
+}
+
+/// Unit vector of each beam in `laser`. Beams beyond the capacity are left out.
+pub fn fill_bearings(sensor: &SensorConfig, bearings: &mut VecView<Vector2<f32>>) {
+    bearings.clear();
+    let side = if sensor.mounting.upside_down { -1.0 } else { 1.0 };
+    for beam in 0..sensor.geometry.beams() {
+        let (s, c) = sin_cos(sensor.geometry.bearing(beam));
+        if bearings.push(Vector2::new(c, side * s)).is_err() {
+            break;
+        }
+    }
+}
+
+/// Places the beams of a scan. `bearings` is [`fill_bearings`] of the same sensor. Work: one step for each beam.
+pub fn deskew(
+    scan: &Scan<'_>,
+    motion: &ScanMotion,
+    sensor: &SensorConfig,
+    config: &DeskewConfig,
+    bearings: &[Vector2<f32>],
+    points: &mut VecView<ScanPoint>,
+) -> DeskewReport {
+    points.clear();
+    let mut report = DeskewReport::default();
+    let beams = scan.ranges_mm.len();
+    let knot_of_beam = (SWEEP_KNOTS - 1) as f32 / beams.saturating_sub(1).max(1) as f32;
+    let first = sensor.geometry.first_step;
+    let (used_from, used_to) = sensor.used_steps;
+    let mut interval = Interval::new(motion, sensor, config, 0);
+    for (beam, (&value_mm, &bearing)) in scan.ranges_mm.iter().zip(bearings).enumerate() {
+        let beam = beam as u16;
+        if !(used_from..=used_to).contains(&first.saturating_add(beam)) {
+            continue;
+        }
+        let range_m = match sensor.codes.read(value_mm) {
+            Reading::Range(range_m) => range_m,
+            Reading::NoEcho => {
+                report.no_echo += 1;
+                continue;
+            }
+            Reading::Bad => {
+                report.bad += 1;
+                continue;
+            }
+        };
+        let knot = f32::from(beam) * knot_of_beam;
+        let index = (knot as usize).min(SWEEP_KNOTS - 2);
+        if index != interval.index {
+            interval = Interval::new(motion, sensor, config, index);
+        }
+        let position = interval.place(bearing * range_m, knot - index as f32);
+        if points.push(ScanPoint { position, range_m, beam }).is_err() {
+            break;
+        }
+        report.points += 1;
+    }
+    report
+}
+
+/// Sensor poses at both ends of one piece of the sweep.
+struct Interval {
+    index: usize,
+    at: Isometry2<f32>,
+    next: Isometry2<f32>,
+}
+
+impl Interval {
+    fn new(motion: &ScanMotion, sensor: &SensorConfig, config: &DeskewConfig, index: usize) -> Self {
+        let knot = |k: usize| match motion.middle_from_knot.get(k) {
+            Some(middle_from_knot) if config.enabled => middle_from_knot * sensor.mounting.base_from_laser,
+            _ => sensor.mounting.base_from_laser,
+        };
+        Self { index, at: knot(index), next: knot(index + 1) }
+    }
+
+    fn place(&self, in_laser: Vector2<f32>, share: f32) -> Point2<f32> {
+        let (p, q) = (self.at * Point2::from(in_laser), self.next * Point2::from(in_laser));
+        p + (q - p) * share
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SlamConfig;
+    use crate::odometry::Increment;
+    use crate::pose::{exp, pose};
+    use heapless::Vec;
+    use nalgebra::Vector3;
+
+    fn run(sensor: &SensorConfig, ranges_mm: &[u16], motion: &ScanMotion) -> Vec<ScanPoint, 682> {
+        let (mut bearings, mut points) = (Vec::<Vector2<f32>, 682>::new(), Vec::<ScanPoint, 682>::new());
+        fill_bearings(sensor, &mut bearings);
+        let config = DeskewConfig { enabled: true };
+        deskew(&Scan { ranges_mm }, motion, sensor, &config, &bearings, &mut points);
+        points
+    }
+
+    fn still() -> ScanMotion {
+        ScanMotion::instantaneous(Increment::identity())
+    }
+
+    #[test]
+    fn front_beam_lies_ahead_of_the_sensor() {
+        let mut ranges = [1u16; 682];
+        ranges[340] = 2000;
+        let sensor = SlamConfig::paper().sensor;
+        let points = run(&sensor, &ranges, &still());
+        assert_eq!(points.len(), 1);
+        assert!((points[0].position - Point2::new(2.14, 0.0)).norm() < 1e-6);
+    }
+
+    #[test]
+    fn upside_down_and_yaw_move_the_beam() {
+        let mut ranges = [1u16; 682];
+        ranges[340 + 256] = 1000;
+        let mut sensor = SlamConfig::paper().sensor;
+        sensor.mounting.base_from_laser = pose(0.0, 0.0, 0.0);
+        assert!((run(&sensor, &ranges, &still())[0].position - Point2::new(0.0, 1.0)).norm() < 1e-5);
+        sensor.mounting.upside_down = true;
+        assert!((run(&sensor, &ranges, &still())[0].position - Point2::new(0.0, -1.0)).norm() < 1e-5);
+        sensor.mounting.base_from_laser = pose(0.0, 0.0, core::f32::consts::FRAC_PI_2);
+        assert!((run(&sensor, &ranges, &still())[0].position - Point2::new(1.0, 0.0)).norm() < 1e-5);
+    }
+
+    /// A robot that turns and drives while the scanner sweeps sees a straight wall straight.
+    #[test]
+    fn a_wall_seen_while_turning_is_straight_after_deskew() {
+        let sensor = SlamConfig::default().sensor;
+        let twist = Vector3::new(0.5, 0.0, 2.6);
+        let geometry = sensor.geometry;
+        let sweep_s = geometry.sweep_us() as f32 * 1e-6;
+        let mut motion = still();
+        for (k, knot) in motion.middle_from_knot.iter_mut().enumerate() {
+            *knot = exp(&(twist * sweep_s * (k as f32 / (SWEEP_KNOTS - 1) as f32 - 0.5)));
+        }
+        // Wall: x = 2 in base at the middle beam.
+        let mut ranges = [0u16; 682];
+        for (beam, range) in ranges.iter_mut().enumerate() {
+            let at = exp(&(twist * sweep_s * (beam as f32 / 681.0 - 0.5))) * sensor.mounting.base_from_laser;
+            let (s, c) = sin_cos(geometry.bearing(beam));
+            let direction = at.rotation * Vector2::new(c, s);
+            let distance = (2.0 - at.translation.x) / direction.x;
+            if distance > 0.0 && distance < 5.0 {
+                *range = (distance * 1000.0 + 0.5) as u16;
+            }
+        }
+        let points = run(&sensor, &ranges, &motion);
+        assert!(points.len() > 300);
+        let worst = points.iter().map(|p| (p.position.x - 2.0).abs()).fold(0.0, f32::max);
+        assert!(worst < 0.001, "worst point {worst} m off the wall");
+        let skewed = run(&sensor, &ranges, &still());
+        let worst = skewed.iter().map(|p| (p.position.x - 2.0).abs()).fold(0.0, f32::max);
+        assert!(worst > 0.1, "without de-skew the wall is bent, {worst} m");
+    }
+}

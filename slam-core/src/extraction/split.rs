@@ -1,0 +1,192 @@
+//! Split and merge in scan order.
+//!
+//! The points are cut into clusters where neighbours lie farther apart than a surface at grazing incidence explains.
+//! A cluster is cut at the point farthest from its chord, in standard deviations of that point's range, until every
+//! piece is straight; neighbouring pieces that are one line after all are joined again; ends that lean off the line
+//! (corners, mixed pixels) are trimmed. Each line is the total-least-squares fit, weighted by range noise.
+//!
+//! Reference: Nguyen et al., "A comparison of line extraction algorithms using 2D range data" (2007), which found
+//! split-and-merge fastest and among the most correct. The chi-square tests are ours.
+
+use heapless::Vec;
+use nalgebra::Point2;
+
+use super::{Collector, viewpoint, weighted_moments};
+use crate::deskew::ScanPoint;
+use crate::math::sin_cos;
+use crate::pose::{cross, perpendicular};
+use crate::scan::SensorConfig;
+use crate::segment::{Moments, Segment};
+
+/// Pieces waiting to be looked at. Each split adds one; deeper clusters give up their smallest detail.
+const STACK: usize = 32;
+
+/// Settings of split and merge.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct SplitConfig {
+    /// Neighbouring points farther apart than this may belong to different surfaces, metres.
+    pub max_gap_m: f32,
+    /// A surface seen at a flatter angle than this is not followed across wider spacings, radians.
+    pub min_incidence_rad: f32,
+    /// Most beams without a distance inside a segment.
+    pub max_missing_beams: u16,
+    /// A point this many standard deviations off the chord splits a piece.
+    pub split_sigmas: f32,
+    /// Neighbouring pieces are one line when joining them costs each point of the smaller piece no more χ² than this.
+    pub merge_chi2: f32,
+    /// Ends farther off the line than this many standard deviations are trimmed.
+    pub trim_sigmas: f32,
+    /// Largest mean χ² of a point of a segment.
+    pub max_mean_chi2: f32,
+    /// Fewest points of a segment.
+    pub min_inliers: u32,
+    /// Shortest segment, metres.
+    pub min_length_m: f32,
+    /// A segment whose direction is less sure than this, by its points' noise, is a cluster and no line, radians.
+    pub max_sigma_direction_rad: f32,
+}
+
+/// Extracts segments. Work: two passes over the points for each level of splitting, at most points² in all when every
+/// split takes off a single point.
+pub(crate) fn extract(
+    points: &[ScanPoint],
+    sensor: &SensorConfig,
+    config: &SplitConfig,
+    out: &mut Collector<'_>,
+) {
+    let sin_incidence = sin_cos(config.min_incidence_rad).0.max(1e-3);
+    let spacing_per_m = sensor.geometry.step_rad() / sin_incidence;
+    let mut rest = points;
+    while !rest.is_empty() {
+        let length = 1 + rest
+            .iter()
+            .zip(rest.iter().skip(1))
+            .take_while(|(a, b)| joined(a, b, config, spacing_per_m))
+            .count();
+        let (cluster, tail) = rest.split_at(length.min(rest.len()));
+        split_cluster(cluster, sensor, config, out);
+        rest = tail;
+    }
+}
+
+/// Whether two neighbouring points may lie on one surface.
+fn joined(a: &ScanPoint, b: &ScanPoint, config: &SplitConfig, spacing_per_m: f32) -> bool {
+    let beams = b.beam.saturating_sub(a.beam);
+    let spacing_m = spacing_per_m * a.range_m.min(b.range_m) * f32::from(beams);
+    let limit_m = config.max_gap_m.max(spacing_m);
+    beams <= config.max_missing_beams.saturating_add(1)
+        && (b.position - a.position).norm_squared() <= limit_m * limit_m
+}
+
+/// A straight run of points and its sums.
+struct Piece<'a> {
+    points: &'a [ScanPoint],
+    moments: Moments,
+}
+
+fn split_cluster(
+    cluster: &[ScanPoint],
+    sensor: &SensorConfig,
+    config: &SplitConfig,
+    out: &mut Collector<'_>,
+) {
+    if (cluster.len() as u32) < config.min_inliers {
+        return;
+    }
+    let mut stack: Vec<(usize, usize), STACK> = Vec::new();
+    // The piece that may still grow at its end.
+    let mut open: Option<(usize, usize, Moments)> = None;
+    let mut next = Some((0, cluster.len()));
+    while let Some((from, to)) = next.or_else(|| stack.pop()) {
+        next = None;
+        let Some(points) = cluster.get(from..to) else { break };
+        if let Some(cut) = farthest_from_chord(points, sensor, config.split_sigmas)
+            && stack.push((from + cut, to)).is_ok()
+        {
+            next = Some((from, from + cut));
+            continue;
+        }
+        let moments = weighted_moments(points, sensor);
+        open = match open {
+            Some((open_from, _, sums)) if is_one_line(&sums, &moments, config) => {
+                Some((open_from, to, sums.merged(&moments)))
+            }
+            closed => {
+                close(cluster, closed, sensor, config, out);
+                Some((from, to, moments))
+            }
+        };
+    }
+    close(cluster, open, sensor, config, out);
+}
+
+fn close(
+    cluster: &[ScanPoint],
+    open: Option<(usize, usize, Moments)>,
+    sensor: &SensorConfig,
+    config: &SplitConfig,
+    out: &mut Collector<'_>,
+) {
+    if let Some((from, to, moments)) = open
+        && let Some(points) = cluster.get(from..to)
+    {
+        finish(Piece { points, moments }, sensor, config, out);
+    }
+}
+
+/// Index at which to cut: the point farthest from the chord, if any is more than `sigmas` standard deviations off.
+fn farthest_from_chord(points: &[ScanPoint], sensor: &SensorConfig, sigmas: f32) -> Option<usize> {
+    let (first, last) = (points.first()?, points.last()?);
+    let chord = last.position - first.position;
+    let length2 = chord.norm_squared();
+    if points.len() < 3 {
+        return None;
+    }
+    let (mut worst, mut cut) = (sigmas * sigmas * length2, None);
+    for (i, point) in points.iter().enumerate().skip(1).take(points.len() - 2) {
+        let off = cross(chord, point.position - first.position);
+        let chi2 = off * off / sensor.noise.variance(point.range_m);
+        if chi2 > worst {
+            (worst, cut) = (chi2, Some(i));
+        }
+    }
+    cut
+}
+
+/// Whether two neighbouring pieces are one line: their common fit must not be worse than their own.
+fn is_one_line(a: &Moments, b: &Moments, config: &SplitConfig) -> bool {
+    let cost = a.merged(b).residual() - a.residual() - b.residual();
+    // 9: the 99 % point of χ² with the two degrees of freedom that a second line has.
+    cost <= (config.merge_chi2 * a.inliers.min(b.inliers) as f32).max(9.0)
+}
+
+/// Trims the ends, tests and keeps a piece.
+fn finish(piece: Piece<'_>, sensor: &SensorConfig, config: &SplitConfig, out: &mut Collector<'_>) {
+    if piece.moments.inliers < config.min_inliers {
+        return;
+    }
+    let normal = perpendicular(piece.moments.direction());
+    let off_line = |point: &ScanPoint| {
+        let off = normal.dot(&(point.position - piece.moments.centroid));
+        off * off > config.trim_sigmas * config.trim_sigmas * sensor.noise.variance(point.range_m)
+    };
+    let leading = piece.points.iter().take_while(|p| off_line(p)).count();
+    let trailing = piece.points.iter().rev().take_while(|p| off_line(p)).count();
+    let Some(kept) = piece.points.get(leading..piece.points.len().saturating_sub(trailing)) else { return };
+    let moments =
+        if kept.len() == piece.points.len() { piece.moments } else { weighted_moments(kept, sensor) };
+    let (Some(first), Some(last)) = (kept.first(), kept.last()) else { return };
+    let ends: [Point2<f32>; 2] = [first.position, last.position];
+    let segment = Segment::fitted(moments, &ends, viewpoint(sensor));
+    let straight = moments.residual() <= config.max_mean_chi2 * moments.inliers as f32;
+    let directed = moments.scatter_along(segment.direction)
+        * config.max_sigma_direction_rad
+        * config.max_sigma_direction_rad
+        >= 1.0;
+    let long = moments.inliers >= config.min_inliers && segment.length_m() >= config.min_length_m;
+    if long && straight && directed {
+        out.push(segment);
+    }
+}

@@ -1,0 +1,90 @@
+//! Line-segment SLAM for a microcontroller: a laser scanner, two wheel encoders, a map of line segments in fixed
+//! memory. No allocation, no `unsafe`, no clock, no panic; the same bits on every machine.
+//!
+//! The algorithm is that of "Least-square Matching for Mobile Robot SLAM Based on Line-segment Model":
+//! [`SlamConfig::paper`] is the paper step for step, [`SlamConfig::default`] our best, through the same pipeline.
+//!
+//! ```text
+//!  ranges_mm ──► deskew ──► extraction ──► association ◄──┐ ──► registration ──► map
+//!                  ▲        [Segment]       [Pair] │      │          ▲            │
+//!  ticks ──► odometry ──► predicted pose ──────────▼──► correction ──┤            │
+//!            [OdometryTrack]                 heading search          │            │
+//!                                                  loop closure ─────┘ ◄──────────┘
+//! ```
+//!
+//! [`Slam::process_scan`](slam::Slam::process_scan) is that drawing; each stage is a module of its own and can be used
+//! without it.
+//!
+//! # Frames and units
+//! Frames follow REP 105: `map`, `odom`, `base` (middle of the axle, x forward, y left, counter-clockwise positive) and
+//! `laser`. A transform `map_from_base` takes coordinates in `base` to `map`; `pose` alone always means
+//! `map_from_base`. Metres, radians, seconds, `f32`; raw values carry their unit in the name (`range_mm`, `stamp_us`).
+//! Times are those of the middle beam of a scan.
+//!
+//! # Reading order
+//! [`slam`] for the whole, [`segment`] for what a line is, then the stages in the order of the drawing. [`config`] has
+//! every constant and where it comes from.
+//!
+//! # Example
+//! ```
+//! use slam_core::odometry::{DifferentialDrive, Integration, ticks_between_u16};
+//! use slam_core::{OdometryTrack, Scan, Slam, SlamConfig};
+//!
+//! let config = SlamConfig::default(); // a URG-04LX, 0.140 m ahead of the axle
+//! let mut slam = Slam::<128>::new(config)?;
+//! let mut track = OdometryTrack::<32>::default();
+//! let drive = DifferentialDrive {
+//!     left_wheel_radius_m: 0.05,
+//!     right_wheel_radius_m: 0.05,
+//!     track_m: 0.3,
+//!     ticks_per_turn: 2000.0,
+//! };
+//!
+//! // As often as the encoders are sampled:
+//! let mut before = [65_530u16, 0];
+//! for (stamp_us, now) in [(0, before), (50_000, [4, 11]), (100_000, [14, 22])] {
+//!     let ticks = [0, 1].map(|wheel| ticks_between_u16(before[wheel], now[wheel]));
+//!     track.push(stamp_us, drive.increment(ticks[0], ticks[1], Integration::Arc)).expect("stamps increase");
+//!     before = now;
+//! }
+//! // As often as the sensor delivers a scan, whose middle beam was taken at 60 ms; there was none before:
+//! let motion = track.scan_motion(None, 60_000, &config.sensor.geometry).expect("the track has samples");
+//! let ranges_mm = [2000u16; 682];
+//! let update = slam.process_scan(&Scan { ranges_mm: &ranges_mm }, &motion);
+//! assert_eq!(update.rejected, None);
+//! # Ok::<(), slam_core::ConfigError>(())
+//! ```
+#![no_std]
+#![forbid(unsafe_code)]
+#![deny(missing_docs)]
+#![cfg_attr(
+    not(test),
+    deny(clippy::indexing_slicing, clippy::unwrap_used, clippy::expect_used, clippy::panic)
+)]
+
+#[cfg(test)]
+extern crate std;
+
+pub mod association;
+pub mod config;
+pub mod correction;
+pub mod deskew;
+pub mod extraction;
+pub mod loop_closure;
+pub mod map;
+pub mod math;
+pub mod odometry;
+pub mod odometry_track;
+pub mod pose;
+pub mod registration;
+pub mod residual;
+pub mod scan;
+pub mod segment;
+pub mod slam;
+
+pub use config::{ConfigError, SlamConfig};
+pub use map::{MapSegment, SegmentMap};
+pub use odometry_track::{OdometryTrack, ScanMotion};
+pub use scan::Scan;
+pub use segment::Segment;
+pub use slam::{Slam, SlamUpdate};

@@ -1,0 +1,171 @@
+//! The map: a fixed number of line segments in `map`.
+//!
+//! When it is full, the segment that was seen in the fewest scans gives way to the new one, the one unseen for longest
+//! among equals; segments of the scan at hand never do. Each eviction and each segment refused is counted.
+
+use heapless::Vec;
+
+use crate::segment::Segment;
+
+/// A segment of the map, 64 bytes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct MapSegment {
+    /// The segment in `map`.
+    pub segment: Segment,
+    /// Number of scans that saw it; stays at its maximum.
+    pub hits: u16,
+    /// Number of the last scan that saw it.
+    pub last_seen: u32,
+    /// Way the robot had driven by then, metres.
+    pub seen_at_m: f32,
+}
+
+/// Up to `N` segments; 64·`N` bytes and a few words. `N` may be up to 65 535.
+#[derive(Clone, Debug, Default)]
+pub struct SegmentMap<const N: usize> {
+    segments: Vec<MapSegment, N>,
+    counters: MapCounters,
+}
+
+/// What happened to the map since it began.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct MapCounters {
+    /// Segments added.
+    pub added: u32,
+    /// Segments dropped to make room for others.
+    pub evicted: u32,
+    /// Segments that found no room because all others were in use.
+    pub refused: u32,
+    /// Segments that became one with another.
+    pub fused: u32,
+}
+
+impl<const N: usize> SegmentMap<N> {
+    /// Size of the map in RAM.
+    pub const BYTES: usize = core::mem::size_of::<Self>();
+
+    const INDEX_FITS: () = assert!(N <= u16::MAX as usize, "a map holds at most 65 535 segments");
+
+    /// No segments.
+    pub const fn new() -> Self {
+        let () = Self::INDEX_FITS;
+        let counters = MapCounters { added: 0, evicted: 0, refused: 0, fused: 0 };
+        Self { segments: Vec::new(), counters }
+    }
+
+    /// The segments, in no order that means anything.
+    pub fn segments(&self) -> &[MapSegment] {
+        &self.segments
+    }
+
+    /// Counters since the map began.
+    pub fn counters(&self) -> MapCounters {
+        self.counters
+    }
+
+    /// Forgets everything, counters included.
+    pub fn clear(&mut self) {
+        *self = Self::new();
+    }
+
+    pub(crate) fn get_mut(&mut self, index: usize) -> Option<&mut MapSegment> {
+        self.segments.get_mut(index)
+    }
+
+    /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns whether it found a place. Work: `N` steps when full.
+    pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> bool {
+        let entry = MapSegment { segment, hits: 1, last_seen: seen, seen_at_m };
+        if self.segments.push(entry).is_ok() {
+            self.counters.added = self.counters.added.saturating_add(1);
+            return true;
+        }
+        let stale = self.segments.iter_mut().filter(|s| s.last_seen != seen);
+        let Some(least) = stale.min_by_key(|s| (s.hits, s.last_seen)) else {
+            self.counters.refused = self.counters.refused.saturating_add(1);
+            return false;
+        };
+        *least = entry;
+        self.counters.evicted = self.counters.evicted.saturating_add(1);
+        self.counters.added = self.counters.added.saturating_add(1);
+        true
+    }
+
+    /// Joins segment `other` to segment `index` and removes it; the last segment takes the place of `other`.
+    pub(crate) fn fuse(&mut self, index: usize, other: usize) {
+        if index == other {
+            return;
+        }
+        let Some(taken) = self.segments.get(other).copied() else { return };
+        let Some(kept) = self.segments.get_mut(index) else { return };
+        kept.segment = kept.segment.merged(&taken.segment);
+        kept.hits = kept.hits.max(taken.hits);
+        kept.last_seen = kept.last_seen.max(taken.last_seen);
+        kept.seen_at_m = kept.seen_at_m.max(taken.seen_at_m);
+        self.segments.swap_remove(other);
+        self.counters.fused = self.counters.fused.saturating_add(1);
+    }
+
+    /// All segments, to be moved.
+    pub(crate) fn iter_mut(&mut self) -> impl Iterator<Item = &mut MapSegment> {
+        self.segments.iter_mut()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Point2;
+
+    fn segment(x: f32) -> Segment {
+        Segment::from_ends(Point2::new(x, 0.0), Point2::new(x, 1.0), 10, 1e-4, Point2::new(x - 1.0, 0.0))
+    }
+
+    #[test]
+    fn size_is_what_the_documentation_says() {
+        assert_eq!(core::mem::size_of::<MapSegment>(), 64);
+        let bytes = SegmentMap::<512>::BYTES;
+        assert!(bytes <= 512 * 64 + 64, "{bytes}");
+    }
+
+    #[test]
+    fn a_full_map_drops_the_segment_seen_least_and_longest_ago() {
+        let mut map = SegmentMap::<3>::new();
+        for (x, scan) in [(1.0, 5), (2.0, 3), (3.0, 4)] {
+            assert!(map.insert(segment(x), scan, 0.0));
+        }
+        map.get_mut(0).unwrap().hits = 9;
+        assert!(map.insert(segment(4.0), 6, 0.0));
+        let kept: std::vec::Vec<f32> = map.segments().iter().map(|s| s.segment.start.x).collect();
+        assert_eq!(kept, [1.0, 4.0, 3.0]);
+        assert_eq!(map.counters().evicted, 1);
+    }
+
+    #[test]
+    fn segments_of_the_scan_at_hand_are_never_dropped() {
+        let mut map = SegmentMap::<2>::new();
+        for x in [1.0, 2.0] {
+            assert!(map.insert(segment(x), 7, 0.0));
+        }
+        assert!(!map.insert(segment(3.0), 7, 0.0));
+        assert_eq!(map.counters(), MapCounters { added: 2, refused: 1, ..MapCounters::default() });
+        assert!(!SegmentMap::<0>::new().insert(segment(1.0), 1, 0.0), "a map without room refuses");
+    }
+
+    #[test]
+    fn fusing_keeps_all_points_and_frees_a_place() {
+        let mut map = SegmentMap::<4>::new();
+        map.insert(segment(1.0), 1, 0.0);
+        map.insert(segment(2.0), 2, 0.0);
+        map.insert(segment(1.01), 3, 0.0);
+        map.fuse(0, 2);
+        assert_eq!(map.segments().len(), 2);
+        assert_eq!(map.segments()[0].segment.moments.inliers, 20);
+        assert_eq!(map.segments()[0].last_seen, 3);
+        map.fuse(0, 0);
+        map.fuse(0, 9);
+        assert_eq!(map.segments().len(), 2, "itself and nobody are not fused");
+    }
+}

@@ -1,0 +1,399 @@
+//! Line segments and the sums they are made of.
+//!
+//! A [`Segment`] is directed: walking from `start` to `end`, the sensor that saw it stood on the left, so its unit
+//! normal points to the free side. The two faces of a thin wall are two segments with opposite normals.
+//!
+//! Its line is the total-least-squares fit to weighted points, held as [`Moments`]: two sets of points join in O(1)
+//! and give exactly the line that all points together would give. Second moments are about the centroid, so that
+//! `f32` keeps its digits a kilometre from the origin.
+
+use nalgebra::{Isometry2, Point2, Vector2};
+
+use crate::math::sqrt;
+use crate::pose::{cross, perpendicular};
+
+/// Weighted sums over points of the plane. A weight is the inverse variance of the point, 1/m².
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Moments {
+    /// Number of points (the paper's n).
+    pub inliers: u32,
+    /// Sum of the weights, 1/m²: the inverse variance of the centroid across the line.
+    pub weight: f32,
+    /// Weighted centroid, metres.
+    pub centroid: Point2<f32>,
+    /// Weighted central second moments Σw·x², Σw·x·y, Σw·y², dimensionless.
+    pub scatter: [f32; 3],
+}
+
+impl Moments {
+    /// No points.
+    pub const EMPTY: Self =
+        Self { inliers: 0, weight: 0.0, centroid: Point2::new(0.0, 0.0), scatter: [0.0, 0.0, 0.0] };
+
+    /// Sums over `(point, weight)` pairs with positive weights. Work: two passes.
+    pub fn from_points(points: impl Iterator<Item = (Point2<f32>, f32)> + Clone) -> Self {
+        let (mut inliers, mut weight, mut sum) = (0u32, 0.0, Vector2::zeros());
+        // Sums are taken from the first point on, the centroid's digits are then those of the extent.
+        let Some((origin, _)) = points.clone().next() else { return Self::EMPTY };
+        for (point, w) in points.clone() {
+            inliers = inliers.saturating_add(1);
+            weight += w;
+            sum += (point - origin) * w;
+        }
+        let centroid = origin + sum / weight;
+        let [mut xx, mut xy, mut yy] = [0.0; 3];
+        for (point, w) in points {
+            let d = point - centroid;
+            xx += w * d.x * d.x;
+            xy += w * d.x * d.y;
+            yy += w * d.y * d.y;
+        }
+        Self { inliers, weight, centroid, scatter: [xx, xy, yy] }
+    }
+
+    /// The sums over both sets of points: exact, by the parallel-axis theorem.
+    #[must_use]
+    pub fn merged(&self, other: &Self) -> Self {
+        let weight = self.weight + other.weight;
+        if weight <= 0.0 {
+            return *self;
+        }
+        let apart = other.centroid - self.centroid;
+        let share = other.weight / weight;
+        let between = self.weight * share;
+        let [xx, xy, yy] = self.scatter;
+        let [oxx, oxy, oyy] = other.scatter;
+        Self {
+            inliers: self.inliers.saturating_add(other.inliers),
+            weight,
+            centroid: self.centroid + apart * share,
+            scatter: [
+                xx + oxx + between * apart.x * apart.x,
+                xy + oxy + between * apart.x * apart.y,
+                yy + oyy + between * apart.y * apart.y,
+            ],
+        }
+    }
+
+    /// The same line, less sure: information about its offset and about its direction are multiplied by these shares.
+    #[must_use]
+    pub fn loosened(&self, offset_share: f32, direction_share: f32) -> Self {
+        Self {
+            weight: self.weight * offset_share,
+            scatter: self.scatter.map(|s| s * direction_share),
+            ..*self
+        }
+    }
+
+    /// The sums of the points carried to another frame.
+    #[must_use]
+    pub fn transformed(&self, to_from_here: &Isometry2<f32>) -> Self {
+        let (c, s) = (to_from_here.rotation.re, to_from_here.rotation.im);
+        let [xx, xy, yy] = self.scatter;
+        Self {
+            centroid: to_from_here * self.centroid,
+            scatter: [
+                c * c * xx - 2.0 * c * s * xy + s * s * yy,
+                c * s * (xx - yy) + (c * c - s * s) * xy,
+                s * s * xx + 2.0 * c * s * xy + c * c * yy,
+            ],
+            ..*self
+        }
+    }
+
+    /// Unit direction in which the points spread most; its sign is arbitrary. x where they spread nowhere.
+    pub fn direction(&self) -> Vector2<f32> {
+        let [xx, xy, yy] = self.scatter;
+        // Half of the angle whose cosine and sine are these, without a transcendental function.
+        let (cos, sin) = (xx - yy, 2.0 * xy);
+        let length = sqrt(cos * cos + sin * sin);
+        if !(length > 0.0 && length.is_finite()) {
+            return Vector2::new(1.0, 0.0);
+        }
+        let (cos, sin) = (cos / length, sin / length);
+        if cos > 0.0 {
+            let x = sqrt(0.5 * (1.0 + cos));
+            Vector2::new(x, 0.5 * sin / x)
+        } else {
+            let y = sqrt(0.5 * (1.0 - cos));
+            Vector2::new(0.5 * sin / y, y)
+        }
+    }
+
+    /// Weighted scatter along a unit direction: the inverse variance of the line's angle, 1/rad².
+    pub fn scatter_along(&self, direction: Vector2<f32>) -> f32 {
+        let [xx, xy, yy] = self.scatter;
+        let (x, y) = (direction.x, direction.y);
+        (x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0)
+    }
+
+    /// Weighted sum of squared distances from the fitted line: χ² of the fit.
+    pub fn residual(&self) -> f32 {
+        self.scatter_along(perpendicular(self.direction()))
+    }
+}
+
+/// A straight line in Hesse normal form: the points p with `normal`·p = `distance_m`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Line {
+    /// Unit normal.
+    pub normal: Vector2<f32>,
+    /// Signed distance of the line from the origin along the normal, metres; negative where the normal points to
+    /// the origin.
+    pub distance_m: f32,
+}
+
+impl Line {
+    /// Signed distance of a point, metres, positive on the side the normal points to.
+    #[inline]
+    pub fn signed_distance(&self, point: Point2<f32>) -> f32 {
+        self.normal.dot(&point.coords) - self.distance_m
+    }
+
+    /// Foot of the perpendicular from a point.
+    pub fn foot(&self, point: Point2<f32>) -> Point2<f32> {
+        point - self.normal * self.signed_distance(point)
+    }
+}
+
+/// A directed line segment with the sums of the points it stands for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Segment {
+    /// The points it was fitted to. Its weight and scatter are the line's covariance.
+    pub moments: Moments,
+    /// Unit direction from start to end; the free side is on its left.
+    pub direction: Vector2<f32>,
+    /// First end, metres.
+    pub start: Point2<f32>,
+    /// Last end, metres.
+    pub end: Point2<f32>,
+}
+
+impl Segment {
+    /// The least-squares segment of points: ends are the farthest feet of `extremes`, and `viewpoint` is on its left.
+    pub fn fitted(moments: Moments, extremes: &[Point2<f32>], viewpoint: Point2<f32>) -> Self {
+        let mut direction = moments.direction();
+        if cross(direction, viewpoint - moments.centroid) < 0.0 {
+            direction = -direction;
+        }
+        Self::along(moments, direction, extremes)
+    }
+
+    /// The segment of two end points that stand for `inliers` points of variance `variance_m2`, as the paper has it:
+    /// half of the points at each end.
+    pub fn from_ends(
+        start: Point2<f32>,
+        end: Point2<f32>,
+        inliers: u32,
+        variance_m2: f32,
+        viewpoint: Point2<f32>,
+    ) -> Self {
+        let weight = 0.5 * inliers as f32 / variance_m2;
+        let mut moments = Moments::from_points([(start, weight), (end, weight)].into_iter());
+        moments.inliers = inliers;
+        Self::fitted(moments, &[start, end], viewpoint)
+    }
+
+    /// The same points carried to another frame.
+    #[must_use]
+    pub fn transformed(&self, to_from_here: &Isometry2<f32>) -> Self {
+        Self {
+            moments: self.moments.transformed(to_from_here),
+            direction: to_from_here.rotation * self.direction,
+            start: to_from_here * self.start,
+            end: to_from_here * self.end,
+        }
+    }
+
+    /// The segment of the points of both: their common least-squares line, from the farthest foot to the farthest.
+    /// It keeps this segment's free side.
+    #[must_use]
+    pub fn merged(&self, other: &Self) -> Self {
+        let moments = self.moments.merged(&other.moments);
+        let mut direction = moments.direction();
+        if direction.dot(&self.direction) < 0.0 {
+            direction = -direction;
+        }
+        Self::along(moments, direction, &[self.start, self.end, other.start, other.end])
+    }
+
+    fn along(moments: Moments, direction: Vector2<f32>, extremes: &[Point2<f32>]) -> Self {
+        let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
+        for point in extremes {
+            let s = direction.dot(&(point - moments.centroid));
+            (least, most) = (least.min(s), most.max(s));
+        }
+        if least > most {
+            (least, most) = (0.0, 0.0);
+        }
+        let (start, end) = (moments.centroid + direction * least, moments.centroid + direction * most);
+        Self { moments, direction, start, end }
+    }
+
+    /// Unit normal, pointing to the free side.
+    #[inline]
+    pub fn normal(&self) -> Vector2<f32> {
+        perpendicular(self.direction)
+    }
+
+    /// The infinite line in Hesse normal form.
+    pub fn line(&self) -> Line {
+        let normal = self.normal();
+        Line { normal, distance_m: normal.dot(&self.moments.centroid.coords) }
+    }
+
+    /// Distance between the ends, metres.
+    pub fn length_m(&self) -> f32 {
+        self.direction.dot(&(self.end - self.start))
+    }
+
+    /// Point half way between the ends.
+    pub fn midpoint(&self) -> Point2<f32> {
+        nalgebra::center(&self.start, &self.end)
+    }
+
+    /// Coordinate of a point along the segment, metres from its centroid.
+    #[inline]
+    pub fn along_of(&self, point: Point2<f32>) -> f32 {
+        self.direction.dot(&(point - self.moments.centroid))
+    }
+
+    /// Length over which `other`, projected on this segment, lies within it, metres; negative: the gap between them.
+    pub fn overlap_m(&self, other: &Self) -> f32 {
+        let (a, b) = (self.along_of(self.start), self.along_of(self.end));
+        let (c, d) = (self.along_of(other.start), self.along_of(other.end));
+        b.min(c.max(d)) - a.max(c.min(d))
+    }
+
+    /// Whether every number is finite.
+    pub fn is_finite(&self) -> bool {
+        let ends = [self.start, self.end, self.moments.centroid];
+        ends.iter().all(|p| p.x.is_finite() && p.y.is_finite())
+            && self.moments.weight.is_finite()
+            && self.moments.scatter.iter().all(|s| s.is_finite())
+            && self.direction.x.is_finite()
+            && self.direction.y.is_finite()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pose::pose;
+    use proptest::prelude::*;
+    use std::vec::Vec;
+
+    fn reference_f64(points: &[(f32, f32)]) -> (f64, f64, [f64; 3]) {
+        let n = points.len() as f64;
+        let mx = points.iter().map(|p| f64::from(p.0)).sum::<f64>() / n;
+        let my = points.iter().map(|p| f64::from(p.1)).sum::<f64>() / n;
+        let mut s = [0.0; 3];
+        for &(x, y) in points {
+            let (dx, dy) = (f64::from(x) - mx, f64::from(y) - my);
+            s[0] += dx * dx;
+            s[1] += dx * dy;
+            s[2] += dy * dy;
+        }
+        (mx, my, s)
+    }
+
+    fn moments(points: &[(f32, f32)]) -> Moments {
+        Moments::from_points(points.iter().map(|&(x, y)| (Point2::new(x, y), 1.0)))
+    }
+
+    fn points_strategy() -> impl Strategy<Value = Vec<(f32, f32)>> {
+        proptest::collection::vec((-8.0f32..8.0, -8.0f32..8.0), 2..60)
+    }
+
+    proptest! {
+        #[test]
+        fn sums_agree_with_f64(points in points_strategy()) {
+            let (mx, my, s) = reference_f64(&points);
+            let m = moments(&points);
+            prop_assert!((f64::from(m.centroid.x) - mx).abs() < 1e-5);
+            prop_assert!((f64::from(m.centroid.y) - my).abs() < 1e-5);
+            for (got, want) in m.scatter.iter().zip(s) {
+                prop_assert!((f64::from(*got) - want).abs() < 1e-5 * (1.0 + s[0] + s[2]));
+            }
+        }
+
+        #[test]
+        fn merging_is_the_fit_to_all_points(a in points_strategy(), b in points_strategy(), far in -1000.0f32..1000.0) {
+            let shift = |points: &[(f32, f32)]| points.iter().map(|&(x, y)| (x + far, y - far)).collect::<Vec<_>>();
+            let (a, b) = (shift(&a), shift(&b));
+            let all = a.iter().chain(&b).copied().collect::<Vec<_>>();
+            let (merged, direct) = (moments(&a).merged(&moments(&b)), moments(&all));
+            prop_assert_eq!(merged.inliers, direct.inliers);
+            prop_assert!((merged.centroid - direct.centroid).norm() < 1e-3);
+            let scale = 1.0 + direct.scatter[0] + direct.scatter[2];
+            for (got, want) in merged.scatter.iter().zip(direct.scatter) {
+                prop_assert!((got - want).abs() < 1e-3 * scale, "{} {}", got, want);
+            }
+        }
+
+        #[test]
+        fn direction_is_the_principal_eigenvector(points in points_strategy()) {
+            let m = moments(&points);
+            let (_, _, [xx, xy, yy]) = reference_f64(&points);
+            let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
+            let anisotropy = ((xx - yy).powi(2) + 4.0 * xy * xy).sqrt() / (xx + yy);
+            prop_assume!(anisotropy > 1e-3);
+            let d = m.direction();
+            let off = f64::from(d.x) * angle.sin() - f64::from(d.y) * angle.cos();
+            prop_assert!(off.abs() < 1e-3, "{}", off);
+            prop_assert!((d.norm() - 1.0).abs() < 1e-5);
+        }
+
+        #[test]
+        fn transforming_sums_is_summing_transformed_points(
+            points in points_strategy(), x in -9.0f32..9.0, y in -9.0f32..9.0, a in -3.1f32..3.1
+        ) {
+            let to = pose(x, y, a);
+            let carried = points
+                .iter()
+                .map(|&(px, py)| { let p = to * Point2::new(px, py); (p.x, p.y) })
+                .collect::<Vec<_>>();
+            let (direct, got) = (moments(&carried), moments(&points).transformed(&to));
+            prop_assert!((got.centroid - direct.centroid).norm() < 1e-4);
+            let scale = 1.0 + direct.scatter[0] + direct.scatter[2];
+            for (g, w) in got.scatter.iter().zip(direct.scatter) {
+                prop_assert!((g - w).abs() < 1e-4 * scale);
+            }
+        }
+    }
+
+    #[test]
+    fn vertical_lines_and_lines_through_the_origin_are_lines_like_others() {
+        let vertical = moments(&[(2.0, -1.0), (2.0, 0.0), (2.0, 3.0)]);
+        assert!(vertical.direction().x.abs() < 1e-6);
+        let segment =
+            Segment::fitted(vertical, &[Point2::new(2.0, -1.0), Point2::new(2.0, 3.0)], Point2::origin());
+        assert!((segment.line().distance_m + 2.0).abs() < 1e-6, "the normal points to the viewpoint");
+        assert!((segment.length_m() - 4.0).abs() < 1e-6);
+        let through = moments(&[(-1.0, -1.0), (0.0, 0.0), (1.0, 1.0)]);
+        let segment = Segment::fitted(through, &[Point2::new(1.0, 1.0)], Point2::new(0.0, 1.0));
+        assert!(segment.line().distance_m.abs() < 1e-6);
+        assert!(segment.line().signed_distance(Point2::new(0.0, 1.0)) > 0.0);
+    }
+
+    #[test]
+    fn no_points_and_one_point_have_a_direction_but_no_extent() {
+        assert_eq!(Moments::from_points(core::iter::empty()), Moments::EMPTY);
+        let one = moments(&[(3.0, 4.0)]);
+        let segment = Segment::fitted(one, &[], Point2::origin());
+        assert!(segment.is_finite());
+        assert_eq!(segment.length_m(), 0.0);
+    }
+
+    #[test]
+    fn overlap_is_negative_across_a_gap() {
+        let wall = |x0: f32, x1: f32| {
+            Segment::from_ends(Point2::new(x0, 0.0), Point2::new(x1, 0.0), 10, 1e-4, Point2::new(0.0, 1.0))
+        };
+        assert!((wall(0.0, 2.0).overlap_m(&wall(1.5, 4.0)) - 0.5).abs() < 1e-6);
+        assert!((wall(0.0, 2.0).overlap_m(&wall(3.0, 4.0)) + 1.0).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,449 @@
+//! The only stateful wiring: a scan and a motion go in, a pose and a map come out.
+
+use heapless::Vec;
+use nalgebra::{Isometry2, Matrix3, Vector2};
+
+use crate::association::{AssociationConfig, Pair, View, associate};
+use crate::config::{ConfigError, SlamConfig};
+use crate::correction::{
+    Correction, CorrectionConfig, Observability, Prior, SearchConfig, Verdict, least_squares,
+    maximum_a_posteriori,
+};
+use crate::deskew::{DeskewReport, ScanPoint, deskew, fill_bearings};
+use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
+use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
+use crate::map::SegmentMap;
+use crate::math::{sqrt, wrap_angle};
+use crate::odometry::Increment;
+use crate::odometry_track::ScanMotion;
+use crate::pose::{components, is_finite, pose, rotate_covariance};
+use crate::registration::{RegistrationReport, Stamp, register, within_reach};
+use crate::scan::Scan;
+use crate::segment::Segment;
+
+/// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
+///
+/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 24 for each beam and 5 KiB.
+pub struct Slam<const N: usize, const BEAMS: usize = 682> {
+    config: SlamConfig,
+    map: SegmentMap<N>,
+    map_from_base: Isometry2<f32>,
+    covariance: Matrix3<f32>,
+    counters: Counters,
+    way_m: f32,
+    closing: PendingClosure,
+    bearings: Vec<Vector2<f32>, BEAMS>,
+    points: Vec<ScanPoint, BEAMS>,
+    observed: Vec<Segment, MAX_SEGMENTS>,
+    pairs: Vec<Pair, MAX_SEGMENTS>,
+    candidates: Vec<u16, N>,
+}
+
+/// What happened since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Counters {
+    /// Scans processed, good or bad.
+    pub scans: u32,
+    /// Scans with another number of ranges than the geometry has beams.
+    pub wrong_beam_count: u32,
+    /// Motions with a number that was not finite; the robot was taken to stand still, unsure by a metre and a radian.
+    pub bad_motion: u32,
+    /// Scans in which no segment was found.
+    pub without_segments: u32,
+    /// Scans that left the pose to the odometry: no pair, or a system that could not be solved.
+    pub uncorrected: u32,
+    /// Loops closed.
+    pub loops_closed: u32,
+    /// Segments that one scan had too many.
+    pub crowded_out: u32,
+}
+
+/// Why a scan was not used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum ScanRejection {
+    /// Another number of ranges than the geometry has beams.
+    WrongBeamCount {
+        /// Beams of the geometry.
+        expected: usize,
+        /// Ranges given.
+        actual: usize,
+    },
+}
+
+/// Outcome of one scan.
+#[derive(Clone, Copy, Debug)]
+pub struct SlamUpdate {
+    /// Pose of `base` in `map` at the scan's middle beam.
+    pub pose: Isometry2<f32>,
+    /// Covariance of (x, y, θ), in `map`.
+    pub covariance: Matrix3<f32>,
+    /// Where the odometry alone put the base, from the last pose.
+    pub predicted: Isometry2<f32>,
+    /// What became of the beams.
+    pub deskew: DeskewReport,
+    /// What was seen.
+    pub extraction: ExtractionReport,
+    /// What it did to the map.
+    pub registration: RegistrationReport,
+    /// Whether the pairs corrected the pose; otherwise it is the prediction.
+    pub corrected: bool,
+    /// Rounds of association and correction.
+    pub iterations: u8,
+    /// Share of the points on observed segments whose segment was recognised, 0 to 1.
+    pub support: f32,
+    /// Root mean square distance of the observed segments from their map lines after the correction, weighted by
+    /// inliers, metres. Zero without pairs.
+    pub residual_m: f32,
+    /// Directions of the pose that the pairs fix.
+    pub observability: Observability,
+    /// Way driven until now, metres.
+    pub way_m: f32,
+    /// Set when this scan closed a loop, and with it the map was bent.
+    pub closure: Option<Closure>,
+    /// Set when the scan was not used. The motion still was.
+    pub rejected: Option<ScanRejection>,
+}
+
+impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
+    /// Size in RAM.
+    pub const BYTES: usize = core::mem::size_of::<Self>();
+
+    /// An empty map, with the robot at its origin.
+    pub fn new(config: SlamConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let beams = config.sensor.geometry.beams();
+        if beams > BEAMS {
+            return Err(ConfigError::TooManyBeams { beams, capacity: BEAMS });
+        }
+        let mut slam = Self {
+            config,
+            map: SegmentMap::new(),
+            map_from_base: Isometry2::identity(),
+            covariance: Matrix3::zeros(),
+            counters: Counters::default(),
+            way_m: 0.0,
+            closing: PendingClosure::default(),
+            bearings: Vec::new(),
+            points: Vec::new(),
+            observed: Vec::new(),
+            pairs: Vec::new(),
+            candidates: Vec::new(),
+        };
+        fill_bearings(&slam.config.sensor, &mut slam.bearings);
+        Ok(slam)
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &SlamConfig {
+        &self.config
+    }
+
+    /// The map.
+    pub fn map(&self) -> &SegmentMap<N> {
+        &self.map
+    }
+
+    /// Pose of `base` in `map` at the last scan.
+    pub fn pose(&self) -> Isometry2<f32> {
+        self.map_from_base
+    }
+
+    /// Covariance of the pose (x, y, θ), in `map`.
+    pub fn covariance(&self) -> Matrix3<f32> {
+        self.covariance
+    }
+
+    /// Counters since the start.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Points of the last scan, in `base` at its middle beam.
+    pub fn points(&self) -> &[ScanPoint] {
+        &self.points
+    }
+
+    /// Segments seen in the last scan, in `base` at its middle beam.
+    pub fn observed(&self) -> &[Segment] {
+        &self.observed
+    }
+
+    /// Takes in one scan and the motion that led to it.
+    ///
+    /// Never panics, whatever the numbers: what cannot be used is counted, see [`Counters`] and
+    /// [`SlamUpdate::rejected`].
+    pub fn process_scan(&mut self, scan: &Scan<'_>, motion: &ScanMotion) -> SlamUpdate {
+        let prior = self.predict(motion);
+        let mut update = SlamUpdate {
+            pose: prior.pose,
+            covariance: prior.covariance,
+            predicted: prior.pose,
+            deskew: DeskewReport::default(),
+            extraction: ExtractionReport::default(),
+            registration: RegistrationReport::default(),
+            corrected: false,
+            iterations: 0,
+            support: 0.0,
+            residual_m: 0.0,
+            observability: Observability::BLIND,
+            way_m: self.way_m,
+            closure: None,
+            rejected: self.rejection(scan),
+        };
+        if update.rejected.is_none() {
+            self.observe(scan, motion, &mut update);
+            self.correct(&prior, motion, &mut update);
+            if let Some(config) = self.config.loop_closure {
+                self.close_loop(&config, &mut update);
+            }
+            self.extend_map(&mut update);
+        }
+        self.count(&update);
+        self.map_from_base = update.pose;
+        self.covariance = update.covariance;
+        update
+    }
+
+    /// Eq. (1) with covariance: where the odometry says the base is.
+    fn predict(&mut self, motion: &ScanMotion) -> Prior {
+        let prior = self.prior_after(&motion.since_previous);
+        let covariance_is_finite = prior.covariance.iter().all(|v| v.is_finite());
+        if !(motion.is_finite() && is_finite(&prior.pose) && covariance_is_finite) {
+            self.counters.bad_motion = self.counters.bad_motion.saturating_add(1);
+            return Prior { pose: self.map_from_base, covariance: Matrix3::identity() };
+        }
+        self.way_m += motion.since_previous.distance_m;
+        prior
+    }
+
+    fn prior_after(&self, increment: &Increment) -> Prior {
+        let c = components(&(self.map_from_base * increment.before_from_after));
+        let moved = increment.before_from_after.translation.vector;
+        // Derivative of the new pose by the old heading.
+        let lever = crate::pose::perpendicular(self.map_from_base.rotation * moved);
+        let mut jacobian = Matrix3::identity();
+        (jacobian.m13, jacobian.m23) = (lever.x, lever.y);
+        let grown = self.config.odometry.noise.covariance(increment);
+        let covariance = jacobian * self.covariance * jacobian.transpose()
+            + rotate_covariance(&self.map_from_base, &grown);
+        Prior { pose: pose(c.x, c.y, c.z), covariance }
+    }
+
+    fn rejection(&self, scan: &Scan<'_>) -> Option<ScanRejection> {
+        let (expected, actual) = (self.config.sensor.geometry.beams(), scan.ranges_mm.len());
+        (expected != actual).then_some(ScanRejection::WrongBeamCount { expected, actual })
+    }
+
+    /// Ranges to segments in `base`.
+    fn observe(&mut self, scan: &Scan<'_>, motion: &ScanMotion, update: &mut SlamUpdate) {
+        let still = ScanMotion::instantaneous(motion.since_previous);
+        let motion = if motion.is_finite() { motion } else { &still };
+        let (sensor, config) = (&self.config.sensor, &self.config);
+        update.deskew = deskew(scan, motion, sensor, &config.deskew, &self.bearings, &mut self.points);
+        update.extraction =
+            extract(&self.points, sensor, &config.extraction, self.counters.scans, &mut self.observed);
+    }
+
+    /// From the prediction to the corrected pose.
+    fn correct(&mut self, prior: &Prior, motion: &ScanMotion, update: &mut SlamUpdate) {
+        let reach_m = match self.config.association {
+            AssociationConfig::Bisector(_) => f32::INFINITY,
+            AssociationConfig::Gated(_) => f32::from(self.config.sensor.codes.max_mm) * 1e-3,
+        };
+        within_reach(self.map.segments(), &prior.pose, reach_m, &mut self.candidates);
+        let predicted = *update;
+        self.refine(prior, update);
+        if let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction {
+            self.search_heading(prior, motion, &config.search, &predicted, update);
+        }
+    }
+
+    /// Rounds of association and correction from the pose of `update`.
+    fn refine(&mut self, prior: &Prior, update: &mut SlamUpdate) {
+        let rounds = match &self.config.correction {
+            CorrectionConfig::LeastSquares => 1,
+            CorrectionConfig::MaximumAPosteriori(config) => config.max_iterations,
+        };
+        for _ in 0..rounds {
+            self.associate(update);
+            update.iterations = update.iterations.saturating_add(1);
+            let Some(correction) = self.step(prior, &update.pose) else { break };
+            update.corrected |= !self.pairs.is_empty();
+            update.pose = correction.pose;
+            update.covariance = correction.covariance;
+            update.observability = correction.observability;
+            if self.converged(&correction) {
+                break;
+            }
+        }
+        update.support = self.support();
+    }
+
+    /// Where little of the scan was recognised, the odometry may have been wrong by more than it knows: other headings
+    /// are tried, with a prior that allows them. The one from which most is recognised wins, if it is much more.
+    fn search_heading(
+        &mut self,
+        prior: &Prior,
+        motion: &ScanMotion,
+        config: &SearchConfig,
+        predicted: &SlamUpdate,
+        best: &mut SlamUpdate,
+    ) {
+        if best.support >= config.below_support || self.candidates.is_empty() {
+            return;
+        }
+        let increment = &motion.since_previous;
+        let moved =
+            if increment.is_finite() { (increment.distance_m + increment.turn_rad).min(1.0) } else { 1.0 };
+        let reach_rad = config.reach_rad * moved;
+        let broad = Prior { covariance: broadened(prior, &self.map_from_base, 0.5 * reach_rad), ..*prior };
+        let centre = components(&prior.pose);
+        let mut winner: Option<SlamUpdate> = None;
+        let turns = (reach_rad / config.step_rad).clamp(0.0, 255.0) as u8;
+        for turn in 1..=turns {
+            for side in [-1.0, 1.0] {
+                let mut hypothesis = *predicted;
+                let offset = side * f32::from(turn) * config.step_rad;
+                hypothesis.pose = pose(centre.x, centre.y, centre.z + offset);
+                hypothesis.covariance = broad.covariance;
+                self.refine(&broad, &mut hypothesis);
+                let least = winner.as_ref().map_or(best.support + config.gain, |w| w.support);
+                if hypothesis.support > least {
+                    winner = Some(hypothesis);
+                }
+            }
+        }
+        if let Some(winner) = winner {
+            *best = winner;
+        }
+        self.associate(best);
+    }
+
+    /// Recognises old parts of the map from which the pose has drifted, and closes the loop.
+    fn close_loop(&mut self, config: &LoopConfig, update: &mut SlamUpdate) {
+        let (map, way_m) = (self.map.segments(), self.way_m);
+        let age = |i: &u16| map.get(usize::from(*i)).map_or(0.0, |s| way_m - s.seen_at_m);
+        let all = self.candidates.clone();
+        let oldest = all.iter().map(age).fold(0.0, f32::max);
+        if oldest < config.min_way_m {
+            return;
+        }
+        self.candidates.retain(|i| age(i) >= config.min_way_m);
+        let prior = Prior { pose: update.pose, covariance: update.covariance + drift(config, oldest) };
+        let mut hypothesis = *update;
+        hypothesis.covariance = prior.covariance;
+        self.refine(&prior, &mut hypothesis);
+        self.candidates = all;
+        let seen =
+            hypothesis.observability.verdict == Verdict::Full && hypothesis.support >= config.min_support;
+        let drifted = chi2_between(&hypothesis.pose, &update.pose, &update.covariance) >= config.min_chi2;
+        let began = self.pairs.iter().filter_map(|p| self.map.segments().get(p.mapped)).map(|s| s.seen_at_m);
+        let loop_began_m = began.fold(0.0, f32::max);
+        if seen && drifted {
+            let closure = Closure { drifted: update.pose, closed: hypothesis.pose, loop_began_m, way_m };
+            if self.closing.confirmed_by(&closure, config) {
+                self.map.iter_mut().for_each(|entry| closure.bend_segment(entry));
+                update.pose = hypothesis.pose;
+                update.covariance = hypothesis.covariance;
+                update.observability = hypothesis.observability;
+                update.closure = Some(closure);
+                self.counters.loops_closed = self.counters.loops_closed.saturating_add(1);
+            }
+        } else {
+            self.closing = PendingClosure::default();
+        }
+        self.associate(update);
+        update.support = self.support();
+    }
+
+    /// Share of the observed inliers that belong to segments with a pair.
+    fn support(&self) -> f32 {
+        let inliers = |s: &Segment| s.moments.inliers as f32;
+        let all: f32 = self.observed.iter().map(inliers).sum();
+        let paired: f32 = self.pairs.iter().filter_map(|p| self.observed.get(p.observed)).map(inliers).sum();
+        if all > 0.0 { paired / all } else { 0.0 }
+    }
+
+    fn associate(&mut self, update: &SlamUpdate) {
+        let config = &self.config;
+        let view =
+            View { pose: &update.pose, covariance: &update.covariance, line_noise: &config.line_noise };
+        let map = self.map.segments();
+        associate(&self.observed, &view, map, &self.candidates, &config.association, &mut self.pairs);
+    }
+
+    fn step(&self, prior: &Prior, at: &Isometry2<f32>) -> Option<Correction> {
+        let (observed, pairs, map) = (&self.observed, &self.pairs, self.map.segments());
+        match &self.config.correction {
+            CorrectionConfig::LeastSquares => {
+                least_squares(observed, pairs, map, at, self.config.sensor.noise.variance(0.0))
+            }
+            CorrectionConfig::MaximumAPosteriori(config) => {
+                maximum_a_posteriori(observed, pairs, map, prior, at, &self.config.line_noise, config)
+            }
+        }
+    }
+
+    fn converged(&self, correction: &Correction) -> bool {
+        match &self.config.correction {
+            CorrectionConfig::LeastSquares => true,
+            CorrectionConfig::MaximumAPosteriori(config) => correction.step <= config.converged_step,
+        }
+    }
+
+    fn extend_map(&mut self, update: &mut SlamUpdate) {
+        let config = &self.config;
+        let view =
+            View { pose: &update.pose, covariance: &update.covariance, line_noise: &config.line_noise };
+        update.residual_m = self.residual_m(&update.pose);
+        let stamp = Stamp { scan: self.counters.scans, way_m: self.way_m };
+        let (observed, pairs) = (&self.observed, &self.pairs);
+        update.registration = register(observed, pairs, &view, &stamp, &config.registration, &mut self.map);
+    }
+
+    fn residual_m(&self, pose: &Isometry2<f32>) -> f32 {
+        let (mut sum, mut points) = (0.0, 0.0);
+        for pair in &self.pairs {
+            let (Some(seen), Some(entry)) =
+                (self.observed.get(pair.observed), self.map.segments().get(pair.mapped))
+            else {
+                continue;
+            };
+            let n = seen.moments.inliers as f32;
+            let distance = entry.segment.line().signed_distance(pose * seen.moments.centroid);
+            sum += n * distance * distance;
+            points += n;
+        }
+        if points > 0.0 { sqrt(sum / points) } else { 0.0 }
+    }
+
+    fn count(&mut self, update: &SlamUpdate) {
+        let add = |counter: &mut u32, amount: u32| *counter = counter.saturating_add(amount);
+        let c = &mut self.counters;
+        add(&mut c.scans, 1);
+        add(&mut c.wrong_beam_count, u32::from(update.rejected.is_some()));
+        add(&mut c.without_segments, u32::from(update.extraction.segments == 0));
+        add(&mut c.uncorrected, u32::from(!update.corrected));
+        add(&mut c.crowded_out, update.extraction.crowded_out);
+    }
+}
+
+/// The prior's covariance with a heading error of `sigma_rad` on top, made half before and half after the motion.
+fn broadened(prior: &Prior, map_from_previous: &Isometry2<f32>, sigma_rad: f32) -> Matrix3<f32> {
+    let moved = prior.pose.translation.vector - map_from_previous.translation.vector;
+    let lever = crate::pose::perpendicular(moved);
+    let early = nalgebra::Vector3::new(lever.x, lever.y, 1.0);
+    let late = nalgebra::Vector3::new(0.0, 0.0, 1.0);
+    prior.covariance + (early * early.transpose() + late * late.transpose()) * (0.5 * sigma_rad * sigma_rad)
+}
+
+/// Squared Mahalanobis distance between two poses.
+fn chi2_between(a: &Isometry2<f32>, b: &Isometry2<f32>, covariance: &Matrix3<f32>) -> f32 {
+    let mut off = components(a) - components(b);
+    off.z = wrap_angle(off.z);
+    covariance.try_inverse().map_or(0.0, |w| off.dot(&(w * off)))
+}

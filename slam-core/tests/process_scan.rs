@@ -1,0 +1,239 @@
+//! The whole pipeline: it never panics, it is reproducible, and it finds its way in a room.
+
+use nalgebra::{Isometry2, Point2, Vector2};
+use proptest::prelude::*;
+use slam_core::correction::Verdict;
+use slam_core::odometry::Increment;
+use slam_core::odometry_track::{SWEEP_KNOTS, ScanMotion};
+use slam_core::pose::{components, pose};
+use slam_core::slam::ScanRejection;
+use slam_core::{Scan, Slam, SlamConfig};
+
+const BEAMS: usize = 682;
+
+fn configs() -> [SlamConfig; 2] {
+    [SlamConfig::default(), SlamConfig::paper()]
+}
+
+fn still() -> ScanMotion {
+    ScanMotion::instantaneous(Increment::identity())
+}
+
+fn moved(before_from_after: Isometry2<f32>) -> ScanMotion {
+    ScanMotion::instantaneous(Increment::from_motion(before_from_after))
+}
+
+/// Ranges in a room of 6 m by 4.4 m with a box in it, seen from `map_from_base`.
+fn room_scan(config: &SlamConfig, map_from_base: &Isometry2<f32>) -> Vec<u16> {
+    let corners = [(-2.0, -2.2), (4.0, -2.2), (4.0, 2.2), (-2.0, 2.2)];
+    let block = [(1.4, -2.2), (1.4, -1.2), (2.2, -1.2), (2.2, -2.2)];
+    let mut walls: Vec<((f32, f32), (f32, f32))> =
+        (0..4).map(|i| (corners[i], corners[(i + 1) % 4])).collect();
+    walls.extend((0..3).map(|i| (block[i], block[i + 1])));
+    let map_from_laser = map_from_base * config.sensor.mounting.base_from_laser;
+    (0..BEAMS)
+        .map(|beam| {
+            let bearing = config.sensor.geometry.bearing(beam);
+            let direction = map_from_laser.rotation * Vector2::new(bearing.cos(), bearing.sin());
+            let cross = |a: Vector2<f32>, b: Vector2<f32>| a.x * b.y - a.y * b.x;
+            let hits = walls.iter().filter_map(|&((x1, y1), (x2, y2))| {
+                let from = Point2::new(x1, y1) - Point2::from(map_from_laser.translation.vector);
+                let along = Vector2::new(x2 - x1, y2 - y1);
+                let denominator = cross(direction, along);
+                let (range, share) = (cross(from, along) / denominator, cross(from, direction) / denominator);
+                ((0.0..=1.0).contains(&share) && range > 0.02).then_some(range)
+            });
+            let range = hits.fold(f32::INFINITY, f32::min);
+            if range < 5.6 { (range * 1000.0).round() as u16 } else { 0 }
+        })
+        .collect()
+}
+
+#[test]
+fn finds_its_way_round_a_room_with_wrong_odometry() {
+    for config in configs() {
+        let mut slam = Slam::<64>::new(config).unwrap();
+        let mut truth = pose(0.0, 0.0, 0.0);
+        let mut worst: f32 = 0.0;
+        for k in 0..120 {
+            let step = if k == 0 { pose(0.0, 0.0, 0.0) } else { pose(0.04, 0.0, 0.05) };
+            truth *= step;
+            // The odometry reports 10 % too much way and a tenth too little turn.
+            let reported = pose(step.translation.x * 1.1, 0.0, step.rotation.angle() * 0.9);
+            let update =
+                slam.process_scan(&Scan { ranges_mm: &room_scan(&config, &truth) }, &moved(reported));
+            worst = worst.max((update.pose.translation.vector - truth.translation.vector).norm());
+        }
+        assert!(worst < 0.05, "worst error {worst} m with {:?}", config.extraction);
+        assert_eq!(slam.counters().scans, 120);
+    }
+}
+
+#[test]
+fn the_same_input_gives_the_same_bits() {
+    for config in configs() {
+        let run = || {
+            let mut slam = Slam::<64>::new(config).unwrap();
+            let mut bits = Vec::new();
+            for k in 0..40 {
+                let truth = pose(0.02 * k as f32, 0.0, 0.03 * k as f32);
+                let update = slam.process_scan(
+                    &Scan { ranges_mm: &room_scan(&config, &truth) },
+                    &moved(pose(0.02, 0.0, 0.03)),
+                );
+                bits.extend(components(&update.pose).iter().map(|v| v.to_bits()));
+                bits.extend(update.covariance.iter().map(|v| v.to_bits()));
+            }
+            (bits, slam.map().segments().to_vec())
+        };
+        assert_eq!(run(), run());
+    }
+}
+
+#[test]
+fn a_small_map_stays_within_its_room_and_says_what_it_dropped() {
+    let config = SlamConfig::default();
+    let mut slam = Slam::<3>::new(config).unwrap();
+    for k in 0..30 {
+        slam.process_scan(
+            &Scan { ranges_mm: &room_scan(&config, &pose(0.0, 0.0, 0.2 * k as f32)) },
+            &moved(pose(0.0, 0.0, 0.2)),
+        );
+    }
+    let counters = slam.map().counters();
+    assert_eq!(slam.map().segments().len(), 3);
+    assert!(counters.evicted + counters.refused > 0, "{counters:?}");
+}
+
+#[test]
+fn without_a_scan_worth_anything_the_odometry_carries_on() {
+    for config in configs() {
+        let mut slam = Slam::<16>::new(config).unwrap();
+        slam.process_scan(&Scan { ranges_mm: &[0; BEAMS] }, &still());
+        let update = slam.process_scan(&Scan { ranges_mm: &[7; BEAMS] }, &moved(pose(0.5, 0.0, 0.1)));
+        assert!((components(&update.pose) - nalgebra::Vector3::new(0.5, 0.0, 0.1)).norm() < 1e-6);
+        assert!(!update.corrected);
+        assert_eq!(update.observability.verdict, Verdict::Blind);
+        assert_eq!((slam.counters().without_segments, slam.counters().uncorrected), (2, 2));
+        assert_eq!(update.deskew.bad, BEAMS as u32);
+    }
+}
+
+#[test]
+fn a_scan_of_the_wrong_size_is_counted_and_its_motion_kept() {
+    let mut slam = Slam::<16>::new(SlamConfig::default()).unwrap();
+    let update = slam.process_scan(&Scan { ranges_mm: &[1000; 17] }, &moved(pose(0.5, 0.0, 0.0)));
+    assert_eq!(update.rejected, Some(ScanRejection::WrongBeamCount { expected: BEAMS, actual: 17 }));
+    assert!((update.pose.translation.x - 0.5).abs() < 1e-6);
+    assert_eq!(slam.counters().wrong_beam_count, 1);
+}
+
+#[test]
+fn a_motion_that_is_not_a_number_is_counted_and_survived() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for config in configs() {
+            let mut slam = Slam::<64>::new(config).unwrap();
+            let here = pose(0.0, 0.0, 0.0);
+            let ranges = room_scan(&config, &here);
+            slam.process_scan(&Scan { ranges_mm: &ranges }, &still());
+            let mut motion = still();
+            motion.since_previous.distance_m = bad;
+            slam.process_scan(&Scan { ranges_mm: &ranges }, &motion);
+            motion.since_previous.distance_m = 0.0;
+            motion.middle_from_knot[3].translation.x = bad;
+            let update = slam.process_scan(&Scan { ranges_mm: &ranges }, &motion);
+            assert!(update.pose.translation.vector.norm() < 0.02);
+            assert_eq!(slam.counters().bad_motion, 2);
+        }
+    }
+}
+
+#[test]
+fn size_in_ram_is_stated() {
+    let bytes = Slam::<512>::BYTES;
+    // 66 bytes a map segment (64 and its index), 24 a beam, 5 KiB of the rest.
+    assert!(bytes <= 66 * 512 + 24 * BEAMS + 5 * 1024, "{bytes}");
+}
+
+fn number() -> impl Strategy<Value = f32> {
+    prop_oneof![
+        4 => -0.3f32..0.3,
+        1 => -2000.0f32..2000.0,
+        1 => Just(f32::NAN),
+        1 => Just(f32::INFINITY),
+        1 => Just(f32::NEG_INFINITY),
+        1 => Just(f32::MAX),
+        1 => Just(0.0),
+    ]
+}
+
+fn any_pose() -> impl Strategy<Value = Isometry2<f32>> {
+    (number(), number(), number()).prop_map(|(x, y, a)| pose(x, y, a))
+}
+
+fn any_motion() -> impl Strategy<Value = ScanMotion> {
+    (any_pose(), number(), number(), any_pose()).prop_map(
+        |(before_from_after, distance_m, turn_rad, knot)| {
+            let since_previous = Increment { before_from_after, distance_m, turn_rad };
+            ScanMotion { since_previous, middle_from_knot: [knot; SWEEP_KNOTS] }
+        },
+    )
+}
+
+fn any_ranges() -> impl Strategy<Value = Vec<u16>> {
+    let full = |value: BoxedStrategy<u16>| proptest::collection::vec(value, BEAMS);
+    prop_oneof![
+        full((0u16..6000).boxed()),
+        full(any::<u16>().boxed()),
+        full((0u16..20).boxed()),
+        full((1900u16..2100).boxed()),
+        full(Just(5600).boxed()),
+        proptest::collection::vec(any::<u16>(), 0..900),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    /// Whatever comes in: no panic, a finite pose, and a map of finite segments. One beam, swapped steps and a map
+    /// without room are among the sensors and sizes.
+    #[test]
+    fn no_input_panics(
+        scans in proptest::collection::vec((any_ranges(), any_motion()), 1..8),
+        paper in any::<bool>(),
+        beams in prop_oneof![Just(BEAMS as u16), Just(2u16), 3u16..BEAMS as u16],
+        upside_down in any::<bool>(),
+    ) {
+        let mut config = if paper { SlamConfig::paper() } else { SlamConfig::default() };
+        config.sensor.geometry.last_step = config.sensor.geometry.first_step + beams - 1;
+        config.sensor.mounting.upside_down = upside_down;
+        let mut slam = Slam::<24>::new(config).unwrap();
+        let mut none = Slam::<0>::new(config).unwrap();
+        for (ranges, motion) in &scans {
+            let cut = ranges.len().min(usize::from(beams));
+            for ranges_mm in [&ranges[..cut], &ranges[..]] {
+                let update = slam.process_scan(&Scan { ranges_mm }, motion);
+                prop_assert!(components(&update.pose).iter().all(|v| v.is_finite()), "{:?}", update.pose);
+                none.process_scan(&Scan { ranges_mm }, motion);
+            }
+            prop_assert!(slam.map().segments().iter().all(|s| s.segment.is_finite()));
+        }
+    }
+
+    /// A robot a kilometre away, after any number of turns, still knows its room.
+    #[test]
+    fn a_room_far_away_is_a_room(x in -1000.0f32..1000.0, y in -1000.0f32..1000.0, turns in -3.1f32..3.1) {
+        let config = SlamConfig::default();
+        let mut slam = Slam::<64>::new(config).unwrap();
+        let start = pose(x, y, turns);
+        slam.process_scan(&Scan { ranges_mm: &[0; BEAMS] }, &moved(start));
+        let mut truth = pose(0.0, 0.0, 0.0);
+        for _ in 0..20 {
+            truth *= pose(0.03, 0.0, 0.3);
+            slam.process_scan(&Scan { ranges_mm: &room_scan(&config, &truth) }, &moved(pose(0.03, 0.0, 0.3)));
+        }
+        let off = (start * truth).inverse() * slam.pose();
+        prop_assert!(off.translation.vector.norm() < 0.05, "{}", off);
+        prop_assert!(off.rotation.angle().abs() < 0.02);
+    }
+}
