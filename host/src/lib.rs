@@ -1,0 +1,9 @@
+//! `lineslam` on a PC.
+#![forbid(unsafe_code)]
+#![deny(missing_docs)]
+
+pub mod log;
+pub mod output;
+pub mod replay;
+pub mod robot;
+pub mod score;

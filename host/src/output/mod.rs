@@ -1,0 +1,85 @@
+//! Files that a replay leaves behind. Each module turns results into the bytes of one kind of file; [`write_all`] puts
+//! them on disk, all or none.
+
+pub mod csv;
+pub mod grid;
+pub mod report;
+pub mod svg;
+pub mod tum;
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// The files could not be written; none was.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", path.display())]
+pub struct WriteError {
+    /// File or folder.
+    pub path: PathBuf,
+    /// What the system said.
+    pub source: std::io::Error,
+}
+
+/// Writes named files into a folder, which is made if needed. All contents are on disk under temporary names before the
+/// first one gets its own.
+pub fn write_all(folder: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), WriteError> {
+    let failed = |path: &Path| {
+        let path = path.to_owned();
+        move |source| WriteError { path, source }
+    };
+    std::fs::create_dir_all(folder).map_err(failed(folder))?;
+    let mut written = Vec::new();
+    for (name, bytes) in files {
+        let path = folder.join(name);
+        if path.is_dir() {
+            return Err(WriteError { path, source: std::io::ErrorKind::IsADirectory.into() });
+        }
+        let mut file = tempfile::Builder::new()
+            .prefix(&format!(".{name}."))
+            .permissions(file_mode())
+            .tempfile_in(folder)
+            .map_err(failed(&path))?;
+        file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(failed(&path))?;
+        written.push((file, path));
+    }
+    for (file, path) in written {
+        file.persist(&path).map_err(|e| WriteError { path, source: e.error })?;
+    }
+    Ok(())
+}
+
+#[cfg(unix)]
+fn file_mode() -> std::fs::Permissions {
+    // Temporary files are private by default; results are for everybody, within the umask.
+    std::os::unix::fs::PermissionsExt::from_mode(0o666)
+}
+
+#[cfg(not(unix))]
+fn file_mode() -> std::fs::Permissions {
+    std::env::temp_dir().metadata().map(|m| m.permissions()).expect("the folder for temporary files exists")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writes_every_file_and_overwrites_old_ones() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("new/out");
+        write_all(&out, &[("a", b"1".to_vec()), ("b", b"2".to_vec())]).unwrap();
+        write_all(&out, &[("a", b"3".to_vec())]).unwrap();
+        assert_eq!(std::fs::read(out.join("a")).unwrap(), b"3");
+        assert_eq!(std::fs::read(out.join("b")).unwrap(), b"2");
+        assert_eq!(std::fs::read_dir(&out).unwrap().count(), 2, "no temporary file stays");
+    }
+
+    #[test]
+    fn writes_nothing_when_one_file_cannot_be_written() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("b")).unwrap();
+        let error = write_all(folder.path(), &[("a", b"1".to_vec()), ("b", b"2".to_vec())]).unwrap_err();
+        assert!(error.path.ends_with("b"));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "only the folder that was there");
+    }
+}

@@ -1,0 +1,126 @@
+//! `report.json`: what a replay used, skipped, cost and made.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use serde::Serialize;
+use slam_core::SlamConfig;
+use slam_core::correction::Verdict;
+use slam_core::map::MapCounters;
+use slam_core::slam::Counters;
+
+use crate::log::Log;
+use crate::replay::Replay;
+use crate::robot::Robot;
+
+/// Everything the file says.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// Format the log was read as.
+    pub format: &'static str,
+    /// Name of the robot.
+    pub robot: String,
+    /// Name of the configuration.
+    pub configuration: String,
+    /// Scans processed.
+    pub scans_used: usize,
+    /// Records skipped, by reason.
+    pub records_skipped: BTreeMap<&'static str, usize>,
+    /// Segments of the final map.
+    pub segments: usize,
+    /// Way driven, by odometry, metres.
+    pub distance_m: f64,
+    /// Time from the first scan to the last, seconds.
+    pub duration_s: f64,
+    /// Time of one scan in the core.
+    pub scan_us: Percentiles,
+    /// Scans by what their pairs fixed.
+    pub observability: BTreeMap<&'static str, usize>,
+    /// Counters of the core.
+    pub counters: Counters,
+    /// Counters of the map.
+    pub map_counters: MapCounters,
+    /// RAM of the `Slam` that was used, bytes.
+    pub slam_bytes: usize,
+    /// Room for map segments.
+    pub map_capacity: usize,
+    /// Every setting.
+    pub config: SlamConfig,
+}
+
+/// Microseconds, measured on this machine.
+#[derive(Debug, Serialize)]
+pub struct Percentiles {
+    /// Half of the scans took less.
+    pub median: f64,
+    /// 99 of 100 scans took less.
+    pub p99: f64,
+    /// The slowest scan.
+    pub max: f64,
+}
+
+impl Percentiles {
+    /// Of a set of durations; all zero when there is none.
+    pub fn of(durations: impl Iterator<Item = Duration>) -> Self {
+        let mut us: Vec<f64> = durations.map(|d| d.as_secs_f64() * 1e6).collect();
+        us.sort_unstable_by(f64::total_cmp);
+        let at = |share: f64| {
+            us.get(((us.len().max(1) - 1) as f64 * share).round() as usize).copied().unwrap_or(0.0)
+        };
+        Self { median: at(0.5), p99: at(0.99), max: at(1.0) }
+    }
+}
+
+impl Report {
+    /// Gathers the report of one replay.
+    pub fn new(log: &Log, robot: &Robot, configuration: &str, replay: &Replay) -> Self {
+        let stamps = replay.steps.first().zip(replay.steps.last());
+        let mut observability = BTreeMap::new();
+        for step in &replay.steps {
+            let verdict = match step.update.observability.verdict {
+                Verdict::Full => "full",
+                Verdict::Corridor => "corridor",
+                Verdict::Blind => "blind",
+            };
+            *observability.entry(verdict).or_default() += 1;
+        }
+        Self {
+            format: log.format,
+            robot: robot.name.clone(),
+            configuration: configuration.to_owned(),
+            scans_used: replay.steps.len(),
+            records_skipped: log.skipped.clone(),
+            segments: replay.map.len(),
+            distance_m: replay.distance_m,
+            duration_s: stamps.map_or(0.0, |(a, b)| (b.stamp_us - a.stamp_us) as f64 * 1e-6),
+            scan_us: Percentiles::of(replay.steps.iter().map(|s| s.took)),
+            observability,
+            counters: replay.counters,
+            map_counters: replay.map_counters,
+            slam_bytes: replay.slam_bytes,
+            map_capacity: crate::replay::MAP_SEGMENTS,
+            config: replay.config,
+        }
+    }
+
+    /// The file's content.
+    pub fn render(&self) -> Result<Vec<u8>, serde_json::Error> {
+        let mut json = serde_json::to_vec_pretty(self)?;
+        json.push(b'\n');
+        Ok(json)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_those_of_the_sorted_times() {
+        let p = Percentiles::of((1..=101).rev().map(Duration::from_micros));
+        for (got, want) in [(p.median, 51.0), (p.p99, 100.0), (p.max, 101.0)] {
+            assert!((got - want).abs() < 1e-9);
+        }
+        assert_eq!(Percentiles::of(std::iter::empty()).max, 0.0);
+    }
+}

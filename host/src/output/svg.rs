@@ -1,0 +1,313 @@
+//! `map.svg`: the map for a person's eyes.
+//!
+//! Bold segments (those seen once or twice thin), the path with arrows, the dead-reckoned path, faint scan points, a
+//! scale bar and a legend. North is y of `map`.
+
+use std::collections::HashSet;
+use std::fmt::Write;
+
+use nalgebra::{Isometry2, Point2, Vector2};
+use slam_core::MapSegment;
+use svg::Document;
+use svg::node::element::{Circle, Group, Line, Path, Rectangle, Text};
+
+use crate::replay::Replay;
+
+const PAPER: &str = "#fbfaf7";
+const INK: &str = "#1d2b3a";
+const FAINT: &str = "#8fa3b5";
+const WALL: &str = "#16324f";
+const PATH: &str = "#d1495b";
+const ODOMETRY: &str = "#edae49";
+const START: &str = "#2a9d8f";
+const FONT: &str = "Inter, Helvetica, Arial, sans-serif";
+
+/// Segments seen in fewer scans are drawn thin.
+const ESTABLISHED_HITS: u16 = 3;
+/// Longer edge of the drawing, pixels.
+const LONG_EDGE_PX: f32 = 1400.0;
+const MARGIN_PX: f32 = 36.0;
+const HEADER_PX: f32 = 74.0;
+const FOOTER_PX: f32 = 58.0;
+const LEAST_WIDTH_PX: f32 = 1090.0;
+/// Scan points are thinned to one a cell of this size, metres, and drawn up to this range.
+const POINT_CELL_M: f32 = 0.04;
+
+/// What the title says.
+pub struct Caption<'a> {
+    /// Name of the log.
+    pub log: &'a str,
+    /// Name of the configuration.
+    pub configuration: &'a str,
+}
+
+/// Where `map` lies on the paper.
+struct View {
+    low: Point2<f32>,
+    high: Point2<f32>,
+    px_per_m: f32,
+    left_px: f32,
+    width_px: f32,
+    height_px: f32,
+}
+
+impl View {
+    fn around(replay: &Replay) -> Self {
+        let mut points: Vec<Point2<f32>> = Vec::new();
+        points.extend(
+            replay
+                .map
+                .iter()
+                .filter(|s| s.hits >= ESTABLISHED_HITS)
+                .flat_map(|s| [s.segment.start, s.segment.end]),
+        );
+        points.extend(replay.steps.iter().map(|s| Point2::from(s.pose_in_final_map.translation.vector)));
+        let (mut low, mut high) = (Point2::new(f32::MAX, f32::MAX), Point2::new(f32::MIN, f32::MIN));
+        for p in &points {
+            (low, high) = (low.inf(p), high.sup(p));
+        }
+        if points.is_empty() {
+            (low, high) = (Point2::origin(), Point2::origin());
+        }
+        // At least two metres, so that a robot that stands still has a picture too.
+        let centre = nalgebra::center(&low, &high);
+        let half = ((high - low) * 0.5).sup(&Vector2::new(1.0, 1.0)) + Vector2::new(0.4, 0.4);
+        let (low, high) = (centre - half, centre + half);
+        let px_per_m = LONG_EDGE_PX / (2.0 * half.max());
+        let drawn_px = 2.0 * half.x * px_per_m;
+        let width_px = (drawn_px + 2.0 * MARGIN_PX).max(LEAST_WIDTH_PX);
+        let height_px = 2.0 * half.y * px_per_m + HEADER_PX + FOOTER_PX;
+        Self { low, high, px_per_m, left_px: 0.5 * (width_px - drawn_px), width_px, height_px }
+    }
+
+    fn px(&self, point: Point2<f32>) -> (f32, f32) {
+        let x = self.left_px + (point.x - self.low.x) * self.px_per_m;
+        let y = HEADER_PX + (self.high.y - point.y) * self.px_per_m;
+        ((x * 10.0).round() / 10.0, (y * 10.0).round() / 10.0)
+    }
+
+    fn holds(&self, point: Point2<f32>) -> bool {
+        point.x > self.low.x && point.x < self.high.x && point.y > self.low.y && point.y < self.high.y
+    }
+}
+
+/// Renders the drawing.
+pub fn render(replay: &Replay, caption: &Caption<'_>) -> String {
+    let view = View::around(replay);
+    let document = Document::new()
+        .set("viewBox", (0, 0, view.width_px.round() as i32, view.height_px.round() as i32))
+        .set("width", view.width_px.round())
+        .set("height", view.height_px.round())
+        .set("font-family", FONT)
+        .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", PAPER))
+        .add(metre_grid(&view))
+        .add(scan_points(replay, &view))
+        .add(dead_reckoning(replay, &view))
+        .add(walls(&replay.map, &view))
+        .add(path(replay, &view))
+        .add(header(replay, caption, &view))
+        .add(footer(&view));
+    format!("{document}\n")
+}
+
+fn metre_grid(view: &View) -> Group {
+    let step = scale_step(view) as i32;
+    let mut d = String::new();
+    let lines = |from: f32, to: f32| (from / step as f32).ceil() as i32..=(to / step as f32).floor() as i32;
+    for k in lines(view.low.x, view.high.x) {
+        let x = (k * step) as f32;
+        let ((x1, y1), (x2, y2)) =
+            (view.px(Point2::new(x, view.low.y)), view.px(Point2::new(x, view.high.y)));
+        let _ = write!(d, "M{x1} {y1}L{x2} {y2}");
+    }
+    for k in lines(view.low.y, view.high.y) {
+        let y = (k * step) as f32;
+        let ((x1, y1), (x2, y2)) =
+            (view.px(Point2::new(view.low.x, y)), view.px(Point2::new(view.high.x, y)));
+        let _ = write!(d, "M{x1} {y1}L{x2} {y2}");
+    }
+    Group::new()
+        .add(Path::new().set("d", d).set("stroke", "#e9e5dc").set("stroke-width", 1).set("fill", "none"))
+}
+
+fn scan_points(replay: &Replay, view: &View) -> Path {
+    let mut cells = HashSet::new();
+    let mut d = String::new();
+    for step in &replay.steps {
+        for point in &step.points {
+            let p = step.pose_in_final_map * point;
+            let cell = ((p.x / POINT_CELL_M).floor() as i32, (p.y / POINT_CELL_M).floor() as i32);
+            if view.holds(p) && cells.insert(cell) {
+                let (x, y) = view.px(p);
+                let _ = write!(d, "M{x} {y}h0");
+            }
+        }
+    }
+    let size = (0.03 * view.px_per_m).clamp(0.7, 2.2);
+    Path::new()
+        .set("d", d)
+        .set("stroke", FAINT)
+        .set("stroke-opacity", 0.5)
+        .set("stroke-width", size)
+        .set("stroke-linecap", "round")
+        .set("fill", "none")
+}
+
+fn walls(map: &[MapSegment], view: &View) -> Group {
+    let (mut once, mut often) = (String::new(), String::new());
+    for entry in map {
+        let ((x1, y1), (x2, y2)) = (view.px(entry.segment.start), view.px(entry.segment.end));
+        let d = if entry.hits >= ESTABLISHED_HITS { &mut often } else { &mut once };
+        if view.holds(entry.segment.midpoint()) {
+            let _ = write!(d, "M{x1} {y1}L{x2} {y2}");
+        }
+    }
+    let stroke = |d: String, width: f32, opacity: f32| {
+        Path::new()
+            .set("d", d)
+            .set("stroke", WALL)
+            .set("stroke-opacity", opacity)
+            .set("stroke-width", width)
+            .set("stroke-linecap", "round")
+            .set("fill", "none")
+    };
+    let bold = wall_width(view);
+    Group::new().add(stroke(once, 0.4 * bold, 0.5)).add(stroke(often, bold, 1.0))
+}
+
+fn wall_width(view: &View) -> f32 {
+    (0.05 * view.px_per_m).clamp(2.2, 5.0)
+}
+
+fn polyline<'a>(poses: impl Iterator<Item = &'a Isometry2<f32>>, view: &View) -> String {
+    let mut d = String::new();
+    let mut last = None;
+    let mut pen_up = true;
+    for pose in poses {
+        let point = Point2::from(pose.translation.vector);
+        if !view.holds(point) {
+            pen_up = true;
+            continue;
+        }
+        let at = view.px(point);
+        if last != Some(at) || pen_up {
+            let _ = write!(d, "{}{} {}", if pen_up { 'M' } else { 'L' }, at.0, at.1);
+            (last, pen_up) = (Some(at), false);
+        }
+    }
+    d
+}
+
+fn dead_reckoning(replay: &Replay, view: &View) -> Path {
+    Path::new()
+        .set("d", polyline(replay.steps.iter().map(|s| &s.odometry), view))
+        .set("stroke", ODOMETRY)
+        .set("stroke-width", 2)
+        .set("stroke-dasharray", "7 5")
+        .set("stroke-linejoin", "round")
+        .set("fill", "none")
+}
+
+fn path(replay: &Replay, view: &View) -> Group {
+    let poses = || replay.steps.iter().map(|s| &s.pose_in_final_map);
+    let line = Path::new()
+        .set("d", polyline(poses(), view))
+        .set("stroke", PATH)
+        .set("stroke-width", 2.2)
+        .set("stroke-linejoin", "round")
+        .set("fill", "none");
+    let mut group = Group::new().add(line).add(arrows(poses(), view));
+    if let Some(first) = poses().next() {
+        let (x, y) = view.px(first.translation.vector.into());
+        let dot = Circle::new().set("cx", x).set("cy", y).set("r", 7).set("fill", START);
+        group = group.add(dot.set("stroke", PAPER).set("stroke-width", 2));
+    }
+    group
+}
+
+/// Arrow heads, one for each stretch of the path, pointing where the robot headed.
+fn arrows<'a>(poses: impl Iterator<Item = &'a Isometry2<f32>>, view: &View) -> Path {
+    let spacing_m = 110.0 / view.px_per_m;
+    let (mut d, mut way_m, mut last) = (String::new(), 0.6 * spacing_m, None::<Point2<f32>>);
+    for pose in poses {
+        let point = Point2::from(pose.translation.vector);
+        way_m += last.map_or(0.0, |last| (point - last).norm());
+        last = Some(point);
+        if way_m < spacing_m || !view.holds(point) {
+            continue;
+        }
+        way_m = 0.0;
+        let (x, y) = view.px(point);
+        let ahead = pose.rotation * Vector2::new(1.0, 0.0);
+        let (fx, fy) = (ahead.x * 8.0, -ahead.y * 8.0);
+        let corner = |along: f32, side: f32| (x + fx * along - fy * side, y + fy * along + fx * side);
+        let (tip, left, notch, right) =
+            (corner(1.0, 0.0), corner(-0.9, 0.75), corner(-0.4, 0.0), corner(-0.9, -0.75));
+        let _ = write!(
+            d,
+            "M{:.1} {:.1}L{:.1} {:.1}L{:.1} {:.1}L{:.1} {:.1}Z",
+            tip.0, tip.1, left.0, left.1, notch.0, notch.1, right.0, right.1
+        );
+    }
+    Path::new().set("d", d).set("fill", PATH).set("stroke", PAPER).set("stroke-width", 1)
+}
+
+fn label(x: f32, y: f32, size: u32, text: impl Into<String>) -> Text {
+    Text::new(text).set("x", x).set("y", y).set("font-size", size).set("fill", INK)
+}
+
+fn header(replay: &Replay, caption: &Caption<'_>, view: &View) -> Group {
+    let title = label(MARGIN_PX, 38.0, 24, caption.log).set("font-weight", 700);
+    let facts = format!(
+        "{} configuration · {} scans · {:.0} m driven · {} segments",
+        caption.configuration,
+        replay.steps.len(),
+        replay.distance_m,
+        replay.map.len(),
+    );
+    let rule = Line::new()
+        .set("x1", MARGIN_PX)
+        .set("x2", view.width_px - MARGIN_PX)
+        .set("y1", HEADER_PX - 4.0)
+        .set("y2", HEADER_PX - 4.0)
+        .set("stroke", "#d8d2c4");
+    Group::new().add(title).add(label(MARGIN_PX, 60.0, 15, facts).set("fill-opacity", 0.75)).add(rule)
+}
+
+/// Scale bar on the left, legend on the right.
+fn footer(view: &View) -> Group {
+    let y = view.height_px - 24.0;
+    let metres = scale_step(view);
+    let length_px = metres * view.px_per_m;
+    let bar = format!("M{MARGIN_PX} {}v10h{length_px}v-10", y - 9.0);
+    let mut group = Group::new()
+        .add(Path::new().set("d", bar).set("stroke", INK).set("stroke-width", 2).set("fill", "none"))
+        .add(label(MARGIN_PX + length_px + 10.0, y + 2.0, 15, format!("{metres} m")));
+    let entries: [(&str, &str, f32, &str, f32); 6] = [
+        ("start", START, 0.0, "", 62.0),
+        ("path", PATH, 2.2, "", 62.0),
+        ("dead reckoning", ODOMETRY, 2.0, "7 5", 136.0),
+        ("map segment", WALL, wall_width(view), "", 122.0),
+        ("seen once or twice", WALL, 0.4 * wall_width(view), "", 164.0),
+        ("scan points", FAINT, 2.0, "0.5 5", 100.0),
+    ];
+    let mut x = view.width_px - MARGIN_PX - entries.iter().map(|e| e.4 + 32.0).sum::<f32>() + 14.0;
+    for (name, colour, width, dashes, text_px) in entries {
+        group = if width > 0.0 {
+            let key = Line::new().set("x1", x).set("x2", x + 26.0).set("y1", y - 4.0).set("y2", y - 4.0);
+            let key = key.set("stroke", colour).set("stroke-width", width).set("stroke-linecap", "round");
+            group.add(if dashes.is_empty() { key } else { key.set("stroke-dasharray", dashes) })
+        } else {
+            group.add(Circle::new().set("cx", x + 18.0).set("cy", y - 4.0).set("r", 7).set("fill", colour))
+        };
+        group = group.add(label(x + 34.0, y + 1.0, 15, name));
+        x += text_px + 32.0;
+    }
+    group
+}
+
+/// A round length that gives a scale bar of convenient size, metres.
+fn scale_step(view: &View) -> f32 {
+    let fits = |m: &f32| m * view.px_per_m >= 60.0;
+    [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0].into_iter().find(fits).unwrap_or(1000.0)
+}

@@ -1,0 +1,349 @@
+//! Robot files: wheels, encoders, scanner and mounting, in TOML.
+//!
+//! Every key is needed and no other is known, so that a slip of the pen is an error that names it, with the file.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use slam_core::SlamConfig;
+use slam_core::odometry::{DifferentialDrive, OdometryNoise};
+use slam_core::pose::pose;
+use slam_core::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry};
+
+/// Why a robot file could not be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RobotError {
+    /// The file could not be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The robot file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown key, a missing key or a wrong type; the message names key and line.
+    #[error("{}: {source}", path.display())]
+    Parse {
+        /// The robot file.
+        path: PathBuf,
+        /// What the parser said.
+        source: Box<toml::de::Error>,
+    },
+    /// A value that no robot has.
+    #[error("{}: {key}: {reason}", path.display())]
+    Impossible {
+        /// The robot file.
+        path: PathBuf,
+        /// Key with its table, as `sensor.steps.last`.
+        key: &'static str,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// A robot, as its file describes it.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Robot {
+    /// What it is called in reports.
+    pub name: String,
+    /// Wheels and encoders; logs that bring poses need none.
+    pub wheels: Option<Wheels>,
+    /// Growth of the odometry's uncertainty.
+    pub odometry_noise: NoiseFile,
+    /// The scanner.
+    pub sensor: Sensor,
+    /// Where the scanner sits.
+    pub mounting: MountingFile,
+}
+
+/// `[wheels]`
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Wheels {
+    /// Radius of the left wheel, metres.
+    pub left_radius_m: f32,
+    /// Radius of the right wheel, metres.
+    pub right_radius_m: f32,
+    /// Distance between the wheels, metres.
+    pub track_m: f32,
+    /// Counter steps for one turn of a wheel.
+    pub ticks_per_turn: f32,
+    /// Width of the counters, after which they wrap: 16 or 32.
+    pub counter_bits: u8,
+}
+
+/// `[odometry_noise]`, standard deviations that grow with the square root of the way.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoiseFile {
+    along_m_per_sqrt_m: f32,
+    across_m_per_sqrt_m: f32,
+    heading_deg_per_sqrt_m: f32,
+    /// Degrees for each square root of a degree turned.
+    heading_deg_per_sqrt_turn_deg: f32,
+    position_floor_m: f32,
+    heading_floor_deg: f32,
+}
+
+/// `[sensor]`
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sensor {
+    /// What it is, for people.
+    pub model: String,
+    min_range_mm: u32,
+    max_range_mm: u32,
+    no_echo_mm: Vec<[u32; 2]>,
+    sigma_m: f32,
+    sigma_per_m: f32,
+    /// Standard deviation of what does not average out over a line's points, metres.
+    line_sigma_m: f32,
+    /// Time from the middle beam to the stamp logged with the scan, seconds.
+    pub scan_delay_s: f64,
+    steps: Option<Steps>,
+    field: Option<Field>,
+}
+
+/// `[sensor.steps]`: a scanner whose beams are known beforehand, in SCIP's terms.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Steps {
+    first: u16,
+    last: u16,
+    front: u16,
+    per_revolution: f32,
+    revolution_s: f64,
+    used: [u16; 2],
+}
+
+/// `[sensor.field]`: a scanner whose number of beams the log states.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Field {
+    of_view_deg: f32,
+}
+
+/// `[mounting]`
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MountingFile {
+    x_m: f32,
+    y_m: f32,
+    yaw_deg: f32,
+    upside_down: bool,
+}
+
+/// Beams and mounting that a log states itself; they overrule the robot file.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StatedGeometry {
+    /// Bearing of the first beam, radians.
+    pub first_bearing_rad: f32,
+    /// Angle between beams, radians.
+    pub step_rad: f32,
+    /// Pose of the scanner on the robot.
+    pub base_from_laser: [f32; 3],
+}
+
+impl Robot {
+    /// Reads and checks a robot file.
+    pub fn load(path: &Path) -> Result<Self, RobotError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RobotError::Read { path: path.to_owned(), source })?;
+        Self::parse(&text, path)
+    }
+
+    /// The robot that a format's logs were recorded with, built in: `robots/mines.toml` or `robots/sick.toml`.
+    pub fn usual_for(format: &str) -> Self {
+        let (text, name) = match format {
+            "mines" => (include_str!("../../robots/mines.toml"), "robots/mines.toml"),
+            _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
+        };
+        Self::parse(text, Path::new(name)).expect("the built-in robots are tested")
+    }
+
+    fn parse(text: &str, path: &Path) -> Result<Self, RobotError> {
+        let robot: Self = toml::from_str(text)
+            .map_err(|source| RobotError::Parse { path: path.to_owned(), source: Box::new(source) })?;
+        robot.check().map_err(|(key, reason)| RobotError::Impossible {
+            path: path.to_owned(),
+            key,
+            reason,
+        })?;
+        Ok(robot)
+    }
+
+    fn check(&self) -> Result<(), (&'static str, String)> {
+        if let Some(w) = &self.wheels {
+            positive("wheels.left_radius_m", w.left_radius_m)?;
+            positive("wheels.right_radius_m", w.right_radius_m)?;
+            positive("wheels.track_m", w.track_m)?;
+            positive("wheels.ticks_per_turn", w.ticks_per_turn)?;
+            if w.counter_bits != 16 && w.counter_bits != 32 {
+                return Err(("wheels.counter_bits", format!("{} is neither 16 nor 32", w.counter_bits)));
+            }
+        }
+        let n = &self.odometry_noise;
+        not_negative("odometry_noise.along_m_per_sqrt_m", n.along_m_per_sqrt_m)?;
+        not_negative("odometry_noise.across_m_per_sqrt_m", n.across_m_per_sqrt_m)?;
+        not_negative("odometry_noise.heading_deg_per_sqrt_m", n.heading_deg_per_sqrt_m)?;
+        not_negative("odometry_noise.heading_deg_per_sqrt_turn_deg", n.heading_deg_per_sqrt_turn_deg)?;
+        positive("odometry_noise.position_floor_m", n.position_floor_m)?;
+        positive("odometry_noise.heading_floor_deg", n.heading_floor_deg)?;
+        self.check_sensor()?;
+        let m = &self.mounting;
+        finite("mounting.x_m", m.x_m)?;
+        finite("mounting.y_m", m.y_m)?;
+        finite("mounting.yaw_deg", m.yaw_deg)
+    }
+
+    fn check_sensor(&self) -> Result<(), (&'static str, String)> {
+        let s = &self.sensor;
+        if s.max_range_mm <= s.min_range_mm {
+            let reason = format!("{} is not above min_range_mm = {}", s.max_range_mm, s.min_range_mm);
+            return Err(("sensor.max_range_mm", reason));
+        }
+        if s.max_range_mm > u32::from(u16::MAX) {
+            return Err(("sensor.max_range_mm", format!("{} is above 65535", s.max_range_mm)));
+        }
+        if s.no_echo_mm.len() > 2 {
+            return Err((
+                "sensor.no_echo_mm",
+                format!("{} intervals, at most 2 are possible", s.no_echo_mm.len()),
+            ));
+        }
+        if let Some([from, to]) = s.no_echo_mm.iter().find(|[from, to]| from > to) {
+            return Err(("sensor.no_echo_mm", format!("interval [{from}, {to}] is empty")));
+        }
+        positive("sensor.sigma_m", s.sigma_m)?;
+        not_negative("sensor.sigma_per_m", s.sigma_per_m)?;
+        positive("sensor.line_sigma_m", s.line_sigma_m)?;
+        if !(-10.0..=10.0).contains(&s.scan_delay_s) {
+            return Err(("sensor.scan_delay_s", format!("{} is not within ±10 s", s.scan_delay_s)));
+        }
+        match (&s.steps, &s.field) {
+            (Some(steps), None) => steps.check(),
+            (None, Some(field)) if field.of_view_deg > 0.0 && field.of_view_deg <= 360.0 => Ok(()),
+            (None, Some(field)) => {
+                Err(("sensor.field.of_view_deg", format!("{} is not within 0 to 360", field.of_view_deg)))
+            }
+            _ => Err(("sensor", "needs either [sensor.steps] or [sensor.field]".into())),
+        }
+    }
+
+    /// Wheel geometry for the core.
+    pub fn drive(&self) -> Option<DifferentialDrive> {
+        self.wheels.map(|w| DifferentialDrive {
+            left_wheel_radius_m: w.left_radius_m,
+            right_wheel_radius_m: w.right_radius_m,
+            track_m: w.track_m,
+            ticks_per_turn: w.ticks_per_turn,
+        })
+    }
+
+    /// Number of ranges a scan must have, where the robot file says so.
+    pub fn beams(&self) -> Option<usize> {
+        self.sensor.steps.map(|s| s.geometry().beams())
+    }
+
+    /// Puts this robot into a configuration. `beams` and `stated` are the log's.
+    pub fn apply(&self, config: &mut SlamConfig, beams: usize, stated: Option<&StatedGeometry>) {
+        let n = &self.odometry_noise;
+        config.odometry.noise = OdometryNoise {
+            sigma_along_m_per_sqrt_m: n.along_m_per_sqrt_m,
+            sigma_across_m_per_sqrt_m: n.across_m_per_sqrt_m,
+            sigma_heading_rad_per_sqrt_m: n.heading_deg_per_sqrt_m.to_radians(),
+            sigma_heading_rad_per_sqrt_rad: n.heading_deg_per_sqrt_turn_deg * 1f32.to_radians().sqrt(),
+            sigma_position_floor_m: n.position_floor_m,
+            sigma_heading_floor_rad: n.heading_floor_deg.to_radians(),
+        };
+        let s = &self.sensor;
+        let saturated = |mm: u32| mm.min(u32::from(u16::MAX)) as u16;
+        let mut no_echo_mm = [(1, 0); 2];
+        for (code, [from, to]) in no_echo_mm.iter_mut().zip(&s.no_echo_mm) {
+            *code = (saturated(*from), saturated(*to));
+        }
+        config.sensor.codes =
+            RangeCodes { min_mm: saturated(s.min_range_mm), max_mm: saturated(s.max_range_mm), no_echo_mm };
+        config.line_noise.sigma_offset_m = s.line_sigma_m;
+        config.sensor.noise = RangeNoise { sigma_m: s.sigma_m, sigma_per_m: s.sigma_per_m };
+        let m = &self.mounting;
+        let mut base_from_laser = pose(m.x_m, m.y_m, m.yaw_deg.to_radians());
+        let last = beams.saturating_sub(1) as u16;
+        (config.sensor.geometry, config.sensor.used_steps) = match (&s.steps, &s.field) {
+            (Some(steps), _) => (steps.geometry(), (steps.used[0], steps.used[1])),
+            (None, field) => {
+                let of_view_rad = field.as_ref().map_or(180.0, |f| f.of_view_deg).to_radians();
+                // 180 and 360 beams leave out the last edge, 181 and 361 have it.
+                let step_rad = of_view_rad / (beams - beams % 2).max(1) as f32;
+                let (step_rad, first_rad) = match stated {
+                    Some(stated) => (stated.step_rad, stated.first_bearing_rad),
+                    None => (step_rad, -0.5 * of_view_rad),
+                };
+                if let Some(stated) = stated {
+                    let [x, y, yaw] = stated.base_from_laser;
+                    base_from_laser = pose(x, y, yaw);
+                }
+                // Steps count from the first beam; what is left of its bearing is yaw.
+                let geometry = ScanGeometry {
+                    first_step: 0,
+                    last_step: last,
+                    front_step: 0,
+                    steps_per_revolution: 2.0 * std::f32::consts::PI / step_rad,
+                    revolution_us: 0,
+                };
+                base_from_laser *= pose(0.0, 0.0, if m.upside_down { -first_rad } else { first_rad });
+                (geometry, (0, last))
+            }
+        };
+        config.sensor.mounting = Mounting { base_from_laser, upside_down: m.upside_down };
+    }
+}
+
+impl Steps {
+    fn geometry(&self) -> ScanGeometry {
+        ScanGeometry {
+            first_step: self.first,
+            last_step: self.last,
+            front_step: self.front,
+            steps_per_revolution: self.per_revolution,
+            revolution_us: (self.revolution_s * 1e6).round() as u32,
+        }
+    }
+
+    fn check(&self) -> Result<(), (&'static str, String)> {
+        positive("sensor.steps.per_revolution", self.per_revolution)?;
+        if self.last <= self.first {
+            return Err(("sensor.steps.last", format!("{} is not above first = {}", self.last, self.first)));
+        }
+        if f32::from(self.last - self.first) > self.per_revolution {
+            return Err(("sensor.steps.last", "the steps are more than a revolution".into()));
+        }
+        if !(0.0..=10.0).contains(&self.revolution_s) {
+            return Err((
+                "sensor.steps.revolution_s",
+                format!("{} is not within 0 to 10 s", self.revolution_s),
+            ));
+        }
+        let [from, to] = self.used;
+        if from > to || from < self.first || to > self.last {
+            return Err((
+                "sensor.steps.used",
+                format!("[{from}, {to}] is not within the steps of the sensor"),
+            ));
+        }
+        Ok(())
+    }
+}
+
+fn finite(key: &'static str, value: f32) -> Result<(), (&'static str, String)> {
+    if value.is_finite() { Ok(()) } else { Err((key, format!("{value} is not finite"))) }
+}
+
+fn positive(key: &'static str, value: f32) -> Result<(), (&'static str, String)> {
+    if value > 0.0 && value.is_finite() { Ok(()) } else { Err((key, format!("{value} is not above zero"))) }
+}
+
+fn not_negative(key: &'static str, value: f32) -> Result<(), (&'static str, String)> {
+    if value >= 0.0 && value.is_finite() { Ok(()) } else { Err((key, format!("{value} is below zero"))) }
+}
