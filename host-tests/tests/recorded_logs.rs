@@ -1,0 +1,199 @@
+//! Recorded logs against their references: the table of absolute trajectory errors, and the promises made on it.
+//!
+//! The logs belong to others and are not part of this project. They are looked for in `../shared/data` beside the
+//! checkout, or in the folder that `LINESLAM_DATA` names; where they are absent each test says that it was skipped.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use comfy_table::{Table, presets};
+use lineslam::log::{self, Format, ReadOptions};
+use lineslam::output::tum;
+use lineslam::replay::{self, Replay};
+use lineslam::robot::Robot;
+use lineslam::score::{absolute_trajectory_error, parse_tum};
+use slam_core::SlamConfig;
+
+/// A log, and the error the default configuration must stay within, metres.
+struct Recorded {
+    name: &'static str,
+    file: &'static str,
+    limit_m: f64,
+}
+
+const LOGS: [Recorded; 5] = [
+    Recorded { name: "exp1", file: "exp1.dat.gz", limit_m: 0.35 },
+    Recorded { name: "csail", file: "csail.log.gz", limit_m: 1.0 },
+    Recorded { name: "fr079", file: "fr079.log.gz", limit_m: 0.25 },
+    Recorded { name: "fr101", file: "fr101.log.gz", limit_m: 0.10 },
+    Recorded { name: "seattle", file: "seattle.log.gz", limit_m: 0.15 },
+];
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn data() -> PathBuf {
+    std::env::var_os("LINESLAM_DATA").map_or_else(|| root().join("../shared/data"), PathBuf::from)
+}
+
+/// Says plainly that a test did nothing. Written past the test harness's capture, so that it is seen.
+fn skipped(test: &str, missing: &Path) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stdout(), "\nSKIPPED {test}: {} is not there", missing.display());
+}
+
+fn path(recorded: &Recorded, test: &str) -> Option<PathBuf> {
+    let path = data().join(recorded.file);
+    if !path.exists() {
+        skipped(test, &path);
+        return None;
+    }
+    Some(path)
+}
+
+fn replay(path: &Path, config: SlamConfig) -> Replay {
+    let options = ReadOptions { format: Format::Auto, beams: None, lenient: false };
+    let log = log::read(path, &options).unwrap();
+    replay::run(&log, &Robot::usual_for(log.format), config, || {}).unwrap()
+}
+
+fn error_m(trajectory: &str, recorded: &Recorded) -> f64 {
+    let reference = std::fs::read_to_string(data().join(format!("{}.ref.tum", recorded.name))).unwrap();
+    absolute_trajectory_error(&parse_tum(trajectory).unwrap(), &parse_tum(&reference).unwrap()).unwrap()
+}
+
+#[test]
+fn default_beats_the_paper_and_dead_reckoning_on_every_log() {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_FULL_CONDENSED);
+    table.set_header(["log", "scans", "dead reckoning", "paper", "default", "promised"]);
+    let mut failures = Vec::new();
+    for recorded in &LOGS {
+        let Some(path) = path(recorded, "default_beats_the_paper_and_dead_reckoning_on_every_log") else {
+            continue;
+        };
+        let ours = replay(&path, SlamConfig::default());
+        let paper = replay(&path, SlamConfig::paper());
+        let error = |text: String| error_m(&text, recorded);
+        let default_m = error(tum::render(replay::trajectory(&ours.steps)));
+        let paper_m = error(tum::render(replay::trajectory(&paper.steps)));
+        let odometry_m = error(tum::render(replay::dead_reckoning(&ours.steps)));
+        let metres = |m: f64| format!("{m:.3}");
+        table.add_row([
+            recorded.name.to_owned(),
+            ours.steps.len().to_string(),
+            metres(odometry_m),
+            metres(paper_m),
+            metres(default_m),
+            format!("≤ {:.2}", recorded.limit_m),
+        ]);
+        if default_m > recorded.limit_m || default_m >= paper_m || default_m >= odometry_m {
+            failures.push(recorded.name);
+        }
+    }
+    println!("Absolute trajectory error, rmse in metres after one SE(2) alignment\n{table}");
+    assert!(failures.is_empty(), "{failures:?} are not as promised");
+}
+
+/// The promise must not hang on one set of numbers: every range is moved by up to ±3 mm, from three seeds.
+#[test]
+fn promises_hold_with_other_noise() {
+    for recorded in &LOGS {
+        let Some(path) = path(recorded, "promises_hold_with_other_noise") else { continue };
+        let options = ReadOptions { format: Format::Auto, beams: None, lenient: false };
+        let original = log::read(&path, &options).unwrap();
+        for seed in 1..=3u64 {
+            let mut log = original.clone();
+            let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+            for range in
+                log.scans.iter_mut().flat_map(|s| &mut s.ranges_mm).filter(|r| (100..60_000).contains(&**r))
+            {
+                // xorshift64
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                *range = *range - 3 + (state % 7) as u16;
+            }
+            let robot = Robot::usual_for(log.format);
+            let result = replay::run(&log, &robot, SlamConfig::default(), || {}).unwrap();
+            let error = error_m(&tum::render(replay::trajectory(&result.steps)), recorded);
+            assert!(error <= recorded.limit_m, "{} with seed {seed}: {error:.3} m", recorded.name);
+        }
+    }
+}
+
+/// The referee is a Python script that needs numpy; `cargo xtask test` provides it.
+#[test]
+fn the_referee_agrees() {
+    let referee = root().join("../shared/referee/score.py");
+    let python = std::env::var_os("LINESLAM_PYTHON").unwrap_or_else(|| "python3".into());
+    let has_numpy = Command::new(&python).args(["-c", "import numpy"]).status().is_ok_and(|s| s.success());
+    if !referee.exists() || !has_numpy {
+        skipped("the_referee_agrees", if has_numpy { &referee } else { Path::new("python3 with numpy") });
+        return;
+    }
+    let folder = std::env::temp_dir().join(format!("lineslam-referee-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    for recorded in &LOGS {
+        let Some(path) = path(recorded, "the_referee_agrees") else { continue };
+        let text = tum::render(replay::trajectory(&replay(&path, SlamConfig::default()).steps));
+        let file = folder.join(format!("{}.tum", recorded.name));
+        std::fs::write(&file, &text).unwrap();
+        let output = Command::new("python3")
+            .arg(&referee)
+            .arg(recorded.name)
+            .arg(&file)
+            .arg("--json")
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let said = String::from_utf8(output.stdout).unwrap();
+        let value = |key: &str| -> f64 {
+            let rest =
+                said.split_once(&format!("\"{key}\":")).unwrap_or_else(|| panic!("no {key} in {said}")).1;
+            rest.split([',', '}']).next().unwrap().trim().parse().unwrap()
+        };
+        assert_eq!(value("coverage"), 1.0, "{}: a pose for every scan", recorded.name);
+        let (theirs, ours) = (value("ate_rmse_m"), error_m(&text, recorded));
+        assert!((theirs - ours).abs() < 1e-4, "{}: the referee says {theirs}, we say {ours}", recorded.name);
+        let thickness_m = value("thickness_med_m");
+        println!("{}: error {theirs:.3} m, wall thickness {thickness_m:.4} m", recorded.name);
+        if recorded.name == "exp1" {
+            assert!(thickness_m <= 0.048, "walls of exp1 are {thickness_m} m thick");
+        }
+    }
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn exp1_replays_within_a_second() {
+    let Some(path) = path(&LOGS[0], "exp1_replays_within_a_second") else { return };
+    let started = Instant::now();
+    let result = replay(&path, SlamConfig::default());
+    let took = started.elapsed();
+    println!("exp1: {} scans read and replayed in {took:?}", result.steps.len());
+    assert_eq!(result.steps.len(), 756);
+    assert!(took < Duration::from_secs(1), "{took:?}");
+}
+
+/// A log replayed twice is the same to the last bit, map and covariances included.
+#[test]
+fn the_same_log_gives_the_same_bits() {
+    let Some(path) = path(&LOGS[0], "the_same_log_gives_the_same_bits") else { return };
+    for config in [SlamConfig::default(), SlamConfig::paper()] {
+        let bits = |r: &Replay| {
+            let mut bits: Vec<u32> = Vec::new();
+            for step in &r.steps {
+                bits.extend([step.pose.translation.x, step.pose.translation.y].map(f32::to_bits));
+                bits.extend([step.pose.rotation.re, step.pose.rotation.im].map(f32::to_bits));
+                bits.extend(step.update.covariance.iter().map(|v| v.to_bits()));
+            }
+            bits
+        };
+        let (a, b) = (replay(&path, config), replay(&path, config));
+        assert_eq!(bits(&a), bits(&b));
+        assert_eq!(a.map, b.map);
+    }
+}
