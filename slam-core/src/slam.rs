@@ -12,7 +12,7 @@ use crate::correction::{
 use crate::deskew::{DeskewReport, ScanPoint, deskew, fill_bearings};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
-use crate::map::SegmentMap;
+use crate::map::{MapCounters, SegmentMap};
 use crate::math::{sqrt, wrap_angle};
 use crate::odometry::Increment;
 use crate::odometry_track::ScanMotion;
@@ -106,6 +106,10 @@ pub struct SlamUpdate {
     pub closure: Option<Closure>,
     /// Set when the scan was not used. The motion still was.
     pub rejected: Option<ScanRejection>,
+    /// Counters of the core, this scan included.
+    pub counters: Counters,
+    /// Counters of the map, this scan included.
+    pub map_counters: MapCounters,
 }
 
 impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
@@ -193,6 +197,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             way_m: self.way_m,
             closure: None,
             rejected: self.rejection(scan),
+            counters: self.counters,
+            map_counters: self.map.counters(),
         };
         if update.rejected.is_none() {
             self.observe(scan, motion, &mut update);
@@ -203,6 +209,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             self.extend_map(&mut update);
         }
         self.count(&update);
+        update.counters = self.counters;
+        update.map_counters = self.map.counters();
         self.map_from_base = update.pose;
         self.covariance = update.covariance;
         update
