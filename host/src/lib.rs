@@ -7,3 +7,4 @@ pub mod output;
 pub mod replay;
 pub mod robot;
 pub mod score;
+pub mod sim;

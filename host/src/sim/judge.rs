@@ -1,0 +1,154 @@
+//! How good a simulated robot's map and trajectory are, measured against the world and the truth.
+
+use nalgebra::{Isometry2, Matrix3, Point2, Vector2, Vector3};
+use slam_core::{MapSegment, Segment};
+
+use super::Drive;
+use super::world::{Disc, Edge, World};
+use crate::replay::Replay;
+use crate::score::{StampedPosition, absolute_trajectory_error};
+
+/// A map line stands for a blueprint wall when it passes this close to the corner, metres, …
+const WALL_DISTANCE_M: f64 = 0.35;
+/// … is this parallel to the wall, as the sine of the angle, …
+const WALL_SINE: f64 = 0.17;
+/// … and ends this close to the corner or beyond it, metres.
+const WALL_REACH_M: f64 = 1.0;
+/// A segment farther than this from everything that stands still is spurious, metres.
+const SPURIOUS_M: f64 = 0.15;
+/// Map segments seen in fewer scans are not yet part of the map that is judged.
+const ESTABLISHED_HITS: u16 = 3;
+
+/// The measures of one simulated drive.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Judgement {
+    /// Equation (11): mean distance between the blueprint's corners and the crossings of the map's lines there, metres.
+    /// `None` where the world names no corner or the map has none of them.
+    pub corner_error_m: Option<f64>,
+    /// Corners of the blueprint that the map has.
+    pub corners_found: usize,
+    /// Corners of the blueprint.
+    pub corners: usize,
+    /// Root mean square position error after one SE(2) alignment, metres.
+    pub ate_rmse_m: f64,
+    /// Distance of the last pose from the truth, metres, in the frame of the start.
+    pub final_position_error_m: f64,
+    /// Largest distance of a pose from the truth, metres, in the frame of the start.
+    pub worst_position_error_m: f64,
+    /// Mean of the normalised estimation error squared of the pose (3 is honest).
+    pub mean_nees: f64,
+    /// Map segments seen in at least three scans.
+    pub established_segments: usize,
+    /// Those of them that are far from everything that stands still.
+    pub spurious_segments: usize,
+}
+
+/// Position errors of a trajectory.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct TrajectoryErrors {
+    /// Root mean square position error after one SE(2) alignment, metres.
+    pub ate_rmse_m: f64,
+    /// Distance of the last pose from the truth, metres.
+    pub final_position_error_m: f64,
+}
+
+/// Errors of poses that begin at the truth's start.
+pub fn trajectory_errors(truth: &[Isometry2<f64>], poses: &[Isometry2<f64>]) -> TrajectoryErrors {
+    let stamped = |poses: &[Isometry2<f64>]| -> Vec<StampedPosition> {
+        let at = |(k, p): (usize, &Isometry2<f64>)| StampedPosition { stamp_s: k as f64, position: p.translation.vector };
+        poses.iter().enumerate().map(at).collect()
+    };
+    let last = truth.last().zip(poses.last());
+    TrajectoryErrors {
+        ate_rmse_m: absolute_trajectory_error(&stamped(poses), &stamped(truth)).unwrap_or(f64::NAN),
+        final_position_error_m: last.map_or(f64::NAN, |(t, p)| (t.translation.vector - p.translation.vector).norm()),
+    }
+}
+
+/// The estimated poses in the world: `map` begins where the robot did.
+pub fn in_world(drive: &Drive, poses: impl Iterator<Item = Isometry2<f32>>) -> Vec<Isometry2<f64>> {
+    let world_from_map = drive.truth.first().copied().unwrap_or_else(Isometry2::identity);
+    poses.map(|pose| world_from_map * nalgebra::convert::<_, Isometry2<f64>>(pose)).collect()
+}
+
+/// Judges a replay of a simulated drive.
+pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
+    let poses = in_world(drive, replay.steps.iter().map(|s| s.pose));
+    let errors = trajectory_errors(&drive.truth, &poses);
+    let distances = drive.truth.iter().zip(&poses).map(|(t, p)| (t.translation.vector - p.translation.vector).norm());
+    let map = map_in_world(drive, &replay.map);
+    let found: Vec<f64> = world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), &map)).collect();
+    let (edges, discs) = (world.edges(), world.discs());
+    let established: Vec<&Segment> =
+        map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
+    let nees: Vec<f64> = (0..poses.len()).filter_map(|k| normalised_error(drive, replay, &poses, k)).collect();
+    Judgement {
+        corner_error_m: (!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64),
+        corners_found: found.len(),
+        corners: world.corners.len(),
+        ate_rmse_m: errors.ate_rmse_m,
+        final_position_error_m: errors.final_position_error_m,
+        worst_position_error_m: distances.fold(0.0, f64::max),
+        mean_nees: nees.iter().sum::<f64>() / nees.len().max(1) as f64,
+        established_segments: established.len(),
+        spurious_segments: established.iter().filter(|s| is_spurious(s, &edges, &discs)).count(),
+    }
+}
+
+/// The map's segments in the blueprint's frame.
+pub fn map_in_world(drive: &Drive, map: &[MapSegment]) -> Vec<MapSegment> {
+    let world_from_map: Isometry2<f32> =
+        drive.truth.first().map_or_else(Isometry2::identity, |t| nalgebra::convert_unchecked(*t));
+    map.iter().map(|entry| MapSegment { segment: entry.segment.transformed(&world_from_map), ..*entry }).collect()
+}
+
+/// Normalised estimation error squared of pose `k`: eᵀP⁻¹e.
+fn normalised_error(drive: &Drive, replay: &Replay, poses: &[Isometry2<f64>], k: usize) -> Option<f64> {
+    let (truth, pose, step) = (drive.truth.get(k)?, poses.get(k)?, replay.steps.get(k)?);
+    // The covariance is in `map`, the error is carried there.
+    let start = drive.truth.first()?;
+    let off = start.rotation.inverse() * (pose.translation.vector - truth.translation.vector);
+    let turn = (truth.rotation.inverse() * pose.rotation).angle();
+    let error = Vector3::new(off.x, off.y, turn);
+    let covariance: Matrix3<f64> = nalgebra::convert(step.update.covariance);
+    Some(error.dot(&(covariance.try_inverse()? * error)))
+}
+
+/// Distance between a corner of the blueprint and the crossing of the map's lines for the two walls that meet there.
+fn corner_error(world: &World, corner: Point2<f64>, map: &[MapSegment]) -> Option<f64> {
+    let walls = world.directions_at(corner);
+    let a = line_for(corner, walls.first()?, map)?;
+    let b = line_for(corner, walls.get(1)?, map)?;
+    // n·p = d for both.
+    let denominator = a.0.perp(&b.0);
+    (denominator.abs() > 0.3).then(|| {
+        let x = (a.1 * b.0.y - b.1 * a.0.y) / denominator;
+        let y = (b.1 * a.0.x - a.1 * b.0.x) / denominator;
+        (Point2::new(x, y) - corner).norm()
+    })
+}
+
+/// Normal and distance of the best-supported map line for a wall that leaves a corner in a direction.
+fn line_for(corner: Point2<f64>, wall: &Vector2<f64>, map: &[MapSegment]) -> Option<(Vector2<f64>, f64)> {
+    let fits = |entry: &&MapSegment| {
+        let segment = &entry.segment;
+        let direction: Vector2<f64> = nalgebra::convert(segment.direction);
+        let ends: [Point2<f64>; 2] = [segment.start, segment.end].map(|p| nalgebra::convert(p));
+        let ways = ends.map(|end| (end - corner).dot(wall));
+        let off = (ends[0] - corner).perp(&direction).abs();
+        direction.perp(wall).abs() < WALL_SINE
+            && off < WALL_DISTANCE_M
+            && ways[0].min(ways[1]) < WALL_REACH_M
+            && ways[0].max(ways[1]) > 0.1
+    };
+    let best = map.iter().filter(fits).max_by_key(|entry| entry.segment.moments.inliers)?;
+    let line = best.segment.line();
+    Some((nalgebra::convert(line.normal), f64::from(line.distance_m)))
+}
+
+fn is_spurious(segment: &Segment, edges: &[Edge], discs: &[Disc]) -> bool {
+    let middle: Point2<f64> = nalgebra::convert(segment.midpoint());
+    let near_edge = |e: &Edge| super::scanner::distance_to(e, middle) <= SPURIOUS_M;
+    let near_disc = |d: &Disc| ((d.centre - middle).norm() - d.radius).abs() <= SPURIOUS_M;
+    !edges.iter().any(near_edge) && !discs.iter().any(near_disc)
+}

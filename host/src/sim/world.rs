@@ -1,0 +1,338 @@
+//! Worlds: a building, what stands and walks in it, and the path a robot takes, in TOML.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::{Point2, Vector2};
+use serde::Deserialize;
+
+/// Why a world could not be used.
+#[derive(Debug, thiserror::Error)]
+pub enum WorldError {
+    /// The file could not be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The world file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown key, a missing key or a wrong type.
+    #[error("{}: {source}", path.display())]
+    Parse {
+        /// The world file.
+        path: PathBuf,
+        /// What the parser said.
+        source: Box<toml::de::Error>,
+    },
+    /// A value that no building has.
+    #[error("{}: {key}: {reason}", path.display())]
+    Impossible {
+        /// The world file.
+        path: PathBuf,
+        /// Key, with its number from 1 in a list.
+        key: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// A world, as its file describes it. Metres and degrees, in the frame of the blueprint.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct World {
+    /// What it is called.
+    pub name: String,
+    /// The building's walls.
+    #[serde(default, rename = "wall")]
+    pub walls: Vec<Wall>,
+    /// Things with straight sides.
+    #[serde(default, rename = "box")]
+    pub boxes: Vec<Cuboid>,
+    /// Round things.
+    #[serde(default, rename = "pillar")]
+    pub pillars: Vec<Pillar>,
+    /// Chairs and tables, of which the scanner sees four legs.
+    #[serde(default, rename = "legs")]
+    pub legs: Vec<Legs>,
+    /// People on their way.
+    #[serde(default, rename = "person")]
+    pub people: Vec<Person>,
+    /// Corners of the blueprint by which a map is judged (eq. 11).
+    #[serde(default, rename = "corner")]
+    pub corners: Vec<Corner>,
+    /// What the robot does.
+    pub path: DrivenPath,
+}
+
+/// Walls along a polyline.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Wall {
+    /// Corners of the polyline.
+    pub points: Vec<[f64; 2]>,
+    /// Whether the last point joins the first.
+    #[serde(default)]
+    pub closed: bool,
+    /// Glass: the scanner sees nothing of it, nor beyond.
+    #[serde(default)]
+    pub glass: bool,
+}
+
+/// A thing with a rectangular outline.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Cuboid {
+    /// Its middle.
+    pub centre: [f64; 2],
+    /// Edge lengths.
+    pub size: [f64; 2],
+    /// Turn, degrees.
+    #[serde(default)]
+    pub yaw_deg: f64,
+}
+
+/// A thing with a round outline.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pillar {
+    /// Its middle.
+    pub centre: [f64; 2],
+    /// Its radius.
+    pub radius: f64,
+}
+
+/// Four round legs at the corners of a rectangle.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Legs {
+    /// Middle of the rectangle.
+    pub centre: [f64; 2],
+    /// Edge lengths.
+    pub size: [f64; 2],
+    /// Turn, degrees.
+    #[serde(default)]
+    pub yaw_deg: f64,
+    /// Radius of a leg.
+    pub radius: f64,
+}
+
+/// A person walking to and fro on a polyline.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Person {
+    /// Radius of the disc the scanner sees.
+    pub radius: f64,
+    /// Way points.
+    pub points: Vec<[f64; 2]>,
+    /// Walking speed, m/s.
+    pub speed: f64,
+    /// Way ahead at the start, metres.
+    #[serde(default)]
+    pub ahead: f64,
+}
+
+/// A corner where two walls meet.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Corner {
+    /// What it is called.
+    pub name: String,
+    /// Where it is.
+    pub at: [f64; 2],
+}
+
+/// The robot's path.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DrivenPath {
+    /// Heading at the first way point, degrees.
+    pub heading_deg: f64,
+    /// Speed where a way point states none, m/s.
+    pub speed: f64,
+    /// Way points, the first of which is the start.
+    pub points: Vec<[f64; 2]>,
+}
+
+/// A straight piece of a surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Edge {
+    /// One end.
+    pub from: Point2<f64>,
+    /// The other end.
+    pub to: Point2<f64>,
+    /// Whether it is glass.
+    pub glass: bool,
+}
+
+/// A round surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Disc {
+    /// Its middle.
+    pub centre: Point2<f64>,
+    /// Its radius.
+    pub radius: f64,
+}
+
+impl World {
+    /// Reads and checks a world file.
+    pub fn load(path: &Path) -> Result<Self, WorldError> {
+        let text =
+            std::fs::read_to_string(path).map_err(|source| WorldError::Read { path: path.to_owned(), source })?;
+        let world: Self = toml::from_str(&text)
+            .map_err(|source| WorldError::Parse { path: path.to_owned(), source: Box::new(source) })?;
+        world.check().map_err(|(key, reason)| WorldError::Impossible { path: path.to_owned(), key, reason })?;
+        Ok(world)
+    }
+
+    fn check(&self) -> Result<(), (String, String)> {
+        let positive = |key: String, value: f64| {
+            if value > 0.0 && value.is_finite() { Ok(()) } else { Err((key, format!("{value} is not above zero"))) }
+        };
+        let finite = |key: &str, points: &[[f64; 2]]| match points.iter().flatten().find(|v| !v.is_finite()) {
+            Some(v) => Err((key.to_owned(), format!("{v} is not finite"))),
+            None => Ok(()),
+        };
+        for (i, wall) in self.walls.iter().enumerate() {
+            finite(&format!("wall {}", i + 1), &wall.points)?;
+            if wall.points.len() < 2 {
+                return Err((format!("wall {}", i + 1), "has fewer than two points".into()));
+            }
+        }
+        for (i, b) in self.boxes.iter().enumerate() {
+            finite(&format!("box {}", i + 1), &[b.centre])?;
+            b.size.into_iter().try_for_each(|v| positive(format!("box {}: size", i + 1), v))?;
+        }
+        for (i, p) in self.pillars.iter().enumerate() {
+            finite(&format!("pillar {}", i + 1), &[p.centre])?;
+            positive(format!("pillar {}: radius", i + 1), p.radius)?;
+        }
+        for (i, l) in self.legs.iter().enumerate() {
+            finite(&format!("legs {}", i + 1), &[l.centre])?;
+            positive(format!("legs {}: radius", i + 1), l.radius)?;
+            l.size.into_iter().try_for_each(|v| positive(format!("legs {}: size", i + 1), v))?;
+        }
+        for (i, p) in self.people.iter().enumerate() {
+            finite(&format!("person {}", i + 1), &p.points)?;
+            positive(format!("person {}: radius", i + 1), p.radius)?;
+            positive(format!("person {}: speed", i + 1), p.speed)?;
+            if p.points.len() < 2 {
+                return Err((format!("person {}", i + 1), "has fewer than two way points".into()));
+            }
+        }
+        finite("path.points", &self.path.points)?;
+        positive("path.speed".into(), self.path.speed)?;
+        if self.path.points.len() < 2 {
+            return Err(("path.points".into(), "has fewer than two way points".into()));
+        }
+        for corner in &self.corners {
+            let directions = self.directions_at(corner.at.into());
+            if directions.len() < 2 {
+                return Err((format!("corner '{}'", corner.name), "no two walls meet there".into()));
+            }
+        }
+        Ok(())
+    }
+
+    /// Every straight surface.
+    pub fn edges(&self) -> Vec<Edge> {
+        let mut edges = self.wall_edges();
+        for b in &self.boxes {
+            let c = rectangle(b.centre, b.size, b.yaw_deg);
+            edges.extend((0..4).map(|i| Edge { from: c[i], to: c[(i + 1) % 4], glass: false }));
+        }
+        edges
+    }
+
+    fn wall_edges(&self) -> Vec<Edge> {
+        let mut edges = Vec::new();
+        for wall in &self.walls {
+            let n = wall.points.len();
+            let pieces = if wall.closed { n } else { n - 1 };
+            edges.extend((0..pieces).map(|i| Edge {
+                from: wall.points[i].into(),
+                to: wall.points[(i + 1) % n].into(),
+                glass: wall.glass,
+            }));
+        }
+        edges
+    }
+
+    /// Every round surface that stays where it is.
+    pub fn discs(&self) -> Vec<Disc> {
+        let mut discs: Vec<Disc> =
+            self.pillars.iter().map(|p| Disc { centre: p.centre.into(), radius: p.radius }).collect();
+        for l in &self.legs {
+            discs.extend(rectangle(l.centre, l.size, l.yaw_deg).map(|centre| Disc { centre, radius: l.radius }));
+        }
+        discs
+    }
+
+    /// Unit directions, away from a point, of the walls that end there.
+    pub fn directions_at(&self, point: Point2<f64>) -> Vec<Vector2<f64>> {
+        let mut directions = Vec::new();
+        for edge in self.wall_edges() {
+            for (end, other) in [(edge.from, edge.to), (edge.to, edge.from)] {
+                if (end - point).norm() < 1e-6 {
+                    directions.push((other - end).normalize());
+                }
+            }
+        }
+        directions
+    }
+
+    /// Where people are at a time.
+    pub fn people_at(&self, time_s: f64) -> Vec<Disc> {
+        self.people
+            .iter()
+            .map(|p| Disc { centre: along(&p.points, p.ahead + p.speed * time_s), radius: p.radius })
+            .collect()
+    }
+
+    /// Pose (x, y, θ) of the robot at the start.
+    pub fn start(&self) -> [f64; 3] {
+        let [x, y] = self.path.points[0];
+        [x, y, self.path.heading_deg.to_radians()]
+    }
+}
+
+fn rectangle(centre: [f64; 2], size: [f64; 2], yaw_deg: f64) -> [Point2<f64>; 4] {
+    let (s, c) = (libm::sin(yaw_deg.to_radians()), libm::cos(yaw_deg.to_radians()));
+    [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)].map(|(u, v)| {
+        let (x, y) = (u * size[0], v * size[1]);
+        Point2::new(centre[0] + c * x - s * y, centre[1] + s * x + c * y)
+    })
+}
+
+/// The point after a way to and fro on a polyline.
+fn along(points: &[[f64; 2]], way: f64) -> Point2<f64> {
+    let points: Vec<Point2<f64>> = points.iter().map(|&p| p.into()).collect();
+    let total: f64 = points.windows(2).map(|w| (w[1] - w[0]).norm()).sum();
+    if total <= 0.0 {
+        return points[0];
+    }
+    let mut rest = way.rem_euclid(2.0 * total);
+    if rest > total {
+        rest = 2.0 * total - rest;
+    }
+    for w in points.windows(2) {
+        let length = (w[1] - w[0]).norm();
+        if rest <= length && length > 0.0 {
+            return w[0] + (w[1] - w[0]) * (rest / length);
+        }
+        rest -= length;
+    }
+    points[points.len() - 1]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn people_walk_to_and_fro() {
+        let points = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]];
+        for (way, x, y) in [(0.0, 0.0, 0.0), (2.5, 2.0, 0.5), (3.5, 2.0, 0.5), (5.0, 1.0, 0.0), (6.5, 0.5, 0.0)] {
+            assert!((along(&points, way) - Point2::new(x, y)).norm() < 1e-12, "{way}");
+        }
+    }
+}
