@@ -97,6 +97,8 @@ pub struct Sensor {
     no_echo_mm: Vec<[u32; 2]>,
     sigma_m: f32,
     sigma_per_m: f32,
+    /// Standard deviation of a beam's bearing, degrees.
+    sigma_bearing_deg: f32,
     /// Standard deviation of what does not average out over a line's points, metres.
     line_sigma_m: f32,
     /// Time from the middle beam to the stamp logged with the scan, seconds.
@@ -217,6 +219,7 @@ impl Robot {
         }
         positive("sensor.sigma_m", s.sigma_m)?;
         not_negative("sensor.sigma_per_m", s.sigma_per_m)?;
+        positive("sensor.sigma_bearing_deg", s.sigma_bearing_deg)?;
         positive("sensor.line_sigma_m", s.line_sigma_m)?;
         if !(-10.0..=10.0).contains(&s.scan_delay_s) {
             return Err(("sensor.scan_delay_s", format!("{} is not within ±10 s", s.scan_delay_s)));
@@ -266,7 +269,11 @@ impl Robot {
         config.sensor.codes =
             RangeCodes { min_mm: saturated(s.min_range_mm), max_mm: saturated(s.max_range_mm), no_echo_mm };
         config.line_noise.sigma_offset_m = s.line_sigma_m;
-        config.sensor.noise = RangeNoise { sigma_m: s.sigma_m, sigma_per_m: s.sigma_per_m };
+        config.sensor.noise = RangeNoise {
+            sigma_m: s.sigma_m,
+            sigma_per_m: s.sigma_per_m,
+            sigma_bearing_rad: s.sigma_bearing_deg.to_radians(),
+        };
         let m = &self.mounting;
         let mut base_from_laser = pose(m.x_m, m.y_m, m.yaw_deg.to_radians());
         let last = beams.saturating_sub(1) as u16;

@@ -53,7 +53,7 @@ const PAPER_SENSOR: SensorConfig = SensorConfig {
     used_steps: (ScanGeometry::URG_04LX.first_step, ScanGeometry::URG_04LX.last_step),
     codes: RangeCodes::URG_04LX,
     // 10 mm up to 1 m, 1 % of the range beyond (data sheet's repeatability, as one curve).
-    noise: RangeNoise { sigma_m: 0.008, sigma_per_m: 0.008 },
+    noise: RangeNoise { sigma_m: 0.01, sigma_per_m: 0.01, sigma_bearing_rad: 0.003 },
     mounting: Mounting { base_from_laser: PAPER_MOUNTING, upside_down: false },
 };
 
@@ -175,6 +175,7 @@ impl SlamConfig {
         check("sensor.codes.max_mm", s.codes.max_mm > s.codes.min_mm)?;
         positive("sensor.noise.sigma_m", s.noise.sigma_m)?;
         not_negative("sensor.noise.sigma_per_m", s.noise.sigma_per_m)?;
+        positive("sensor.noise.sigma_bearing_rad", s.noise.sigma_bearing_rad)?;
         check("sensor.mounting.base_from_laser", crate::pose::is_finite(&s.mounting.base_from_laser))
     }
 

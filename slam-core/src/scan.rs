@@ -96,7 +96,7 @@ pub enum Reading {
     Bad,
 }
 
-/// Range noise of a scanner: σ = √(`sigma_m`² + (`sigma_per_m` · range)²).
+/// Noise of a scanner's beams; along the beam σ = √(`sigma_m`² + (`sigma_per_m` · range)²).
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(deny_unknown_fields))]
@@ -105,6 +105,8 @@ pub struct RangeNoise {
     pub sigma_m: f32,
     /// Growth with range, metres for each metre.
     pub sigma_per_m: f32,
+    /// Standard deviation of a beam's bearing, radians: its width and its error. It counts where a surface is seen flat.
+    pub sigma_bearing_rad: f32,
 }
 
 impl RangeNoise {

@@ -76,7 +76,8 @@ impl Base {
     /// Drives on for a short while.
     pub fn step(&mut self, dt_s: f64) {
         let [speed, turn] = self.wanted();
-        let towards = |now: f64, wanted: f64, most: f64| now + (wanted - now).clamp(-most * dt_s, most * dt_s);
+        let towards =
+            |now: f64, wanted: f64, most: f64| now + (wanted - now).clamp(-most * dt_s, most * dt_s);
         self.twist[0] = towards(self.twist[0], speed, MOST_ACCELERATION_M_S2);
         self.twist[1] = towards(self.twist[1], turn, MOST_TURN_ACCELERATION_RAD_S2);
         let [v, w] = self.twist;
@@ -95,7 +96,8 @@ impl Base {
     /// Counters of the left and right wheel, as wide as the robot's.
     pub fn ticks(&self) -> [i64; 2] {
         self.angle.map(|angle| {
-            let ticks = (angle / (2.0 * std::f64::consts::PI) * f64::from(self.wheels.ticks_per_turn)).floor() as i64;
+            let ticks =
+                (angle / (2.0 * std::f64::consts::PI) * f64::from(self.wheels.ticks_per_turn)).floor() as i64;
             if self.wheels.counter_bits == 16 { ticks.rem_euclid(1 << 16) } else { ticks }
         })
     }

@@ -55,13 +55,17 @@ pub struct TrajectoryErrors {
 /// Errors of poses that begin at the truth's start.
 pub fn trajectory_errors(truth: &[Isometry2<f64>], poses: &[Isometry2<f64>]) -> TrajectoryErrors {
     let stamped = |poses: &[Isometry2<f64>]| -> Vec<StampedPosition> {
-        let at = |(k, p): (usize, &Isometry2<f64>)| StampedPosition { stamp_s: k as f64, position: p.translation.vector };
+        let at = |(k, p): (usize, &Isometry2<f64>)| StampedPosition {
+            stamp_s: k as f64,
+            position: p.translation.vector,
+        };
         poses.iter().enumerate().map(at).collect()
     };
     let last = truth.last().zip(poses.last());
     TrajectoryErrors {
         ate_rmse_m: absolute_trajectory_error(&stamped(poses), &stamped(truth)).unwrap_or(f64::NAN),
-        final_position_error_m: last.map_or(f64::NAN, |(t, p)| (t.translation.vector - p.translation.vector).norm()),
+        final_position_error_m: last
+            .map_or(f64::NAN, |(t, p)| (t.translation.vector - p.translation.vector).norm()),
     }
 }
 
@@ -75,13 +79,16 @@ pub fn in_world(drive: &Drive, poses: impl Iterator<Item = Isometry2<f32>>) -> V
 pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
     let poses = in_world(drive, replay.steps.iter().map(|s| s.pose));
     let errors = trajectory_errors(&drive.truth, &poses);
-    let distances = drive.truth.iter().zip(&poses).map(|(t, p)| (t.translation.vector - p.translation.vector).norm());
+    let distances =
+        drive.truth.iter().zip(&poses).map(|(t, p)| (t.translation.vector - p.translation.vector).norm());
     let map = map_in_world(drive, &replay.map);
-    let found: Vec<f64> = world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), &map)).collect();
+    let found: Vec<f64> =
+        world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), &map)).collect();
     let (edges, discs) = (world.edges(), world.discs());
     let established: Vec<&Segment> =
         map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
-    let nees: Vec<f64> = (0..poses.len()).filter_map(|k| normalised_error(drive, replay, &poses, k)).collect();
+    let nees: Vec<f64> =
+        (0..poses.len()).filter_map(|k| normalised_error(drive, replay, &poses, k)).collect();
     Judgement {
         corner_error_m: (!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64),
         corners_found: found.len(),
@@ -99,7 +106,9 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
 pub fn map_in_world(drive: &Drive, map: &[MapSegment]) -> Vec<MapSegment> {
     let world_from_map: Isometry2<f32> =
         drive.truth.first().map_or_else(Isometry2::identity, |t| nalgebra::convert_unchecked(*t));
-    map.iter().map(|entry| MapSegment { segment: entry.segment.transformed(&world_from_map), ..*entry }).collect()
+    map.iter()
+        .map(|entry| MapSegment { segment: entry.segment.transformed(&world_from_map), ..*entry })
+        .collect()
 }
 
 /// Normalised estimation error squared of pose `k`: eᵀP⁻¹e.

@@ -160,10 +160,16 @@ pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result
     let first_beam_us = f64::from(geometry.first_step) * beam_us;
     let middle_us = first_beam_us + 0.5 * geometry.sweep_us() as f64;
     let delay_us = (sim.sensor.delay_s * 1e6).round().max(0.0);
-    let mut drive = Drive { log: Log { format: "mines", ..Log::default() }, truth: Vec::new(), true_wheels: base.truth() };
+    let mut drive = Drive {
+        log: Log { format: "mines", ..Log::default() },
+        truth: Vec::new(),
+        true_wheels: base.truth(),
+    };
     for k in 0.. {
         let begin_us = k * period_us;
-        let need_us = begin_us + (middle_us + delay_us).max(first_beam_us + geometry.sweep_us() as f64) as u64 + STEP_US;
+        let need_us = begin_us
+            + (middle_us + delay_us).max(first_beam_us + geometry.sweep_us() as f64) as u64
+            + STEP_US;
         while (poses.len() as u64 - 1) * STEP_US < need_us {
             base.step(STEP_US as f64 * 1e-6);
             poses.push(base.pose);

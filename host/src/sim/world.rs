@@ -176,17 +176,25 @@ pub struct Disc {
 impl World {
     /// Reads and checks a world file.
     pub fn load(path: &Path) -> Result<Self, WorldError> {
-        let text =
-            std::fs::read_to_string(path).map_err(|source| WorldError::Read { path: path.to_owned(), source })?;
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| WorldError::Read { path: path.to_owned(), source })?;
         let world: Self = toml::from_str(&text)
             .map_err(|source| WorldError::Parse { path: path.to_owned(), source: Box::new(source) })?;
-        world.check().map_err(|(key, reason)| WorldError::Impossible { path: path.to_owned(), key, reason })?;
+        world.check().map_err(|(key, reason)| WorldError::Impossible {
+            path: path.to_owned(),
+            key,
+            reason,
+        })?;
         Ok(world)
     }
 
     fn check(&self) -> Result<(), (String, String)> {
         let positive = |key: String, value: f64| {
-            if value > 0.0 && value.is_finite() { Ok(()) } else { Err((key, format!("{value} is not above zero"))) }
+            if value > 0.0 && value.is_finite() {
+                Ok(())
+            } else {
+                Err((key, format!("{value} is not above zero")))
+            }
         };
         let finite = |key: &str, points: &[[f64; 2]]| match points.iter().flatten().find(|v| !v.is_finite()) {
             Some(v) => Err((key.to_owned(), format!("{v} is not finite"))),
@@ -262,7 +270,9 @@ impl World {
         let mut discs: Vec<Disc> =
             self.pillars.iter().map(|p| Disc { centre: p.centre.into(), radius: p.radius }).collect();
         for l in &self.legs {
-            discs.extend(rectangle(l.centre, l.size, l.yaw_deg).map(|centre| Disc { centre, radius: l.radius }));
+            discs.extend(
+                rectangle(l.centre, l.size, l.yaw_deg).map(|centre| Disc { centre, radius: l.radius }),
+            );
         }
         discs
     }
@@ -331,7 +341,9 @@ mod tests {
     #[test]
     fn people_walk_to_and_fro() {
         let points = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]];
-        for (way, x, y) in [(0.0, 0.0, 0.0), (2.5, 2.0, 0.5), (3.5, 2.0, 0.5), (5.0, 1.0, 0.0), (6.5, 0.5, 0.0)] {
+        for (way, x, y) in
+            [(0.0, 0.0, 0.0), (2.5, 2.0, 0.5), (3.5, 2.0, 0.5), (5.0, 1.0, 0.0), (6.5, 0.5, 0.0)]
+        {
             assert!((along(&points, way) - Point2::new(x, y)).norm() < 1e-12, "{way}");
         }
     }

@@ -10,14 +10,14 @@ pub mod ransac;
 pub mod split;
 
 use heapless::VecView;
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector2};
 
 pub use ransac::RansacConfig;
 pub use split::SplitConfig;
 
 use crate::deskew::ScanPoint;
 use crate::scan::SensorConfig;
-use crate::segment::{Moments, Segment};
+use crate::segment::Segment;
 
 /// Most segments kept of one scan: 64, 52 bytes each.
 pub const MAX_SEGMENTS: usize = 64;
@@ -54,10 +54,11 @@ pub fn extract(
     segments: &mut VecView<Segment>,
 ) -> ExtractionReport {
     segments.clear();
+    let view = Viewpoint::new(sensor);
     let mut out = Collector { segments, report: ExtractionReport::default() };
     match config {
-        ExtractionConfig::Ransac(config) => ransac::extract(points, sensor, config, scan_number, &mut out),
-        ExtractionConfig::Split(config) => split::extract(points, sensor, config, &mut out),
+        ExtractionConfig::Ransac(config) => ransac::extract(points, &view, config, scan_number, &mut out),
+        ExtractionConfig::Split(config) => split::extract(points, &view, config, &mut out),
     }
     out.report.segments = out.segments.len() as u32;
     out.report
@@ -84,14 +85,26 @@ impl Collector<'_> {
     }
 }
 
-/// Where the sensor stood at the middle beam, in `base`.
-pub(crate) fn viewpoint(sensor: &SensorConfig) -> Point2<f32> {
-    sensor.mounting.base_from_laser.translation.vector.into()
+/// Variance of a point across a surface with this unit normal, m²: range noise acts along the beam, the beam's own
+/// uncertain bearing and its width across it.
+pub(crate) fn variance_across(point: &ScanPoint, normal: Vector2<f32>, view: &Viewpoint<'_>) -> f32 {
+    let (noise, range2) = (&view.sensor.noise, point.range_m * point.range_m);
+    let along_beam = normal.dot(&(point.position - view.position));
+    let cos2 = (along_beam * along_beam / range2).min(1.0);
+    noise.variance(point.range_m) * cos2
+        + noise.sigma_bearing_rad * noise.sigma_bearing_rad * range2 * (1.0 - cos2)
 }
 
-/// Weighted sums over a run of points, each weighing the inverse of its range variance.
-pub(crate) fn weighted_moments(points: &[ScanPoint], sensor: &SensorConfig) -> Moments {
-    Moments::from_points(points.iter().map(|p| (p.position, 1.0 / sensor.noise.variance(p.range_m))))
+/// The sensor and where it stood at the middle beam, in `base`.
+pub(crate) struct Viewpoint<'a> {
+    pub sensor: &'a SensorConfig,
+    pub position: Point2<f32>,
+}
+
+impl<'a> Viewpoint<'a> {
+    pub(crate) fn new(sensor: &'a SensorConfig) -> Self {
+        Self { sensor, position: sensor.mounting.base_from_laser.translation.vector.into() }
+    }
 }
 
 #[cfg(test)]
@@ -99,7 +112,6 @@ mod tests {
     use super::*;
     use crate::SlamConfig;
     use heapless::Vec;
-    use nalgebra::Vector2;
     use std::vec::Vec as StdVec;
 
     /// Both ends.

@@ -11,11 +11,10 @@ use nalgebra::Point2;
 use rand_core::{Rng, SeedableRng};
 use rand_pcg::Pcg32;
 
-use super::{Collector, MAX_SEGMENTS, viewpoint};
+use super::{Collector, MAX_SEGMENTS, Viewpoint};
 use crate::deskew::ScanPoint;
 use crate::math::sqrt;
 use crate::pose::perpendicular;
-use crate::scan::SensorConfig;
 use crate::segment::{Line, Moments, Segment};
 
 /// Most beams of a scan that RANSAC can tell apart; points of later beams are left out.
@@ -84,7 +83,7 @@ impl Free {
 /// Extracts segments. Work: at most [`MAX_SEGMENTS`] lines of `draws` passes over the points.
 pub(crate) fn extract(
     points: &[ScanPoint],
-    sensor: &SensorConfig,
+    view: &Viewpoint<'_>,
     config: &RansacConfig,
     scan_number: u32,
     out: &mut Collector<'_>,
@@ -96,7 +95,7 @@ pub(crate) fn extract(
             return;
         }
         let Some(line) = best_line(points, &free, config, &mut rng) else { return };
-        take_line(points, &mut free, &line, sensor, config, out);
+        take_line(points, &mut free, &line, view, config, out);
     }
 }
 
@@ -137,7 +136,7 @@ fn take_line(
     points: &[ScanPoint],
     free: &mut Free,
     line: &Line,
-    sensor: &SensorConfig,
+    view: &Viewpoint<'_>,
     config: &RansacConfig,
     out: &mut Collector<'_>,
 ) {
@@ -150,13 +149,13 @@ fn take_line(
         if let Some(last) = run.last()
             && (point.position - last).norm_squared() > config.max_gap_m * config.max_gap_m
         {
-            finish(&run, sensor, config, out);
+            finish(&run, view, config, out);
             run.clear();
         }
         // The run cannot be longer than the points, of which there are at most as many.
         let _ = run.push(point.position);
     }
-    finish(&run, sensor, config, out);
+    finish(&run, view, config, out);
     for index in 0..points.len() {
         if taken.get(index / 32).is_some_and(|word| word & (1 << (index % 32)) != 0) {
             free.remove(index);
@@ -165,12 +164,12 @@ fn take_line(
 }
 
 /// A run of inliers becomes a segment: the least-squares line, ended by the feet of the first and the last of them.
-fn finish(run: &[Point2<f32>], sensor: &SensorConfig, config: &RansacConfig, out: &mut Collector<'_>) {
+fn finish(run: &[Point2<f32>], view: &Viewpoint<'_>, config: &RansacConfig, out: &mut Collector<'_>) {
     let (Some(first), Some(last)) = (run.first(), run.last()) else { return };
     if run.len() < usize::from(config.min_inliers) {
         return;
     }
-    let weight = 1.0 / sensor.noise.variance(0.0);
+    let weight = 1.0 / view.sensor.noise.variance(0.0);
     let moments = Moments::from_points(run.iter().map(|&p| (p, weight)));
-    out.push(Segment::fitted(moments, &[*first, *last], viewpoint(sensor)));
+    out.push(Segment::fitted(moments, &[*first, *last], view.position));
 }

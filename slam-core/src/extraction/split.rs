@@ -9,17 +9,19 @@
 //! split-and-merge fastest and among the most correct. The chi-square tests are ours.
 
 use heapless::Vec;
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector2};
 
-use super::{Collector, viewpoint, weighted_moments};
+use super::{Collector, Viewpoint, variance_across};
 use crate::deskew::ScanPoint;
-use crate::math::sin_cos;
-use crate::pose::{cross, perpendicular};
-use crate::scan::SensorConfig;
+use crate::math::{sin_cos, sqrt};
+use crate::pose::perpendicular;
 use crate::segment::{Moments, Segment};
 
 /// Pieces waiting to be looked at. Each split adds one; deeper clusters give up their smallest detail.
 const STACK: usize = 32;
+
+/// A line goes on behind this many points off it.
+const MOST_STRAYS: usize = 2;
 
 /// Settings of split and merge.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -52,12 +54,12 @@ pub struct SplitConfig {
 /// split takes off a single point.
 pub(crate) fn extract(
     points: &[ScanPoint],
-    sensor: &SensorConfig,
+    view: &Viewpoint<'_>,
     config: &SplitConfig,
     out: &mut Collector<'_>,
 ) {
     let sin_incidence = sin_cos(config.min_incidence_rad).0.max(1e-3);
-    let spacing_per_m = sensor.geometry.step_rad() / sin_incidence;
+    let spacing_per_m = view.sensor.geometry.step_rad() / sin_incidence;
     let mut rest = points;
     while !rest.is_empty() {
         let length = 1 + rest
@@ -66,7 +68,7 @@ pub(crate) fn extract(
             .take_while(|(a, b)| joined(a, b, config, spacing_per_m))
             .count();
         let (cluster, tail) = rest.split_at(length.min(rest.len()));
-        split_cluster(cluster, sensor, config, out);
+        split_cluster(cluster, view, config, out);
         rest = tail;
     }
 }
@@ -86,12 +88,7 @@ struct Piece<'a> {
     moments: Moments,
 }
 
-fn split_cluster(
-    cluster: &[ScanPoint],
-    sensor: &SensorConfig,
-    config: &SplitConfig,
-    out: &mut Collector<'_>,
-) {
+fn split_cluster(cluster: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConfig, out: &mut Collector<'_>) {
     if (cluster.len() as u32) < config.min_inliers {
         return;
     }
@@ -102,57 +99,80 @@ fn split_cluster(
     while let Some((from, to)) = next.or_else(|| stack.pop()) {
         next = None;
         let Some(points) = cluster.get(from..to) else { break };
-        if let Some(cut) = farthest_from_chord(points, sensor, config.split_sigmas)
+        if let Some(cut) = farthest_from_chord(points, view, config.split_sigmas)
             && stack.push((from + cut, to)).is_ok()
         {
             next = Some((from, from + cut));
             continue;
         }
-        let moments = weighted_moments(points, sensor);
+        let moments = chord_moments(points, view);
         open = match open {
             Some((open_from, _, sums)) if is_one_line(&sums, &moments, config) => {
                 Some((open_from, to, sums.merged(&moments)))
             }
+            // A point or two off the line are noise until the next piece says otherwise.
+            Some(line) if points.len() <= MOST_STRAYS && line.1 + MOST_STRAYS >= to => Some(line),
             closed => {
-                close(cluster, closed, sensor, config, out);
+                close(cluster, closed, view, config, out);
                 Some((from, to, moments))
             }
         };
     }
-    close(cluster, open, sensor, config, out);
+    close(cluster, open, view, config, out);
 }
 
 fn close(
     cluster: &[ScanPoint],
     open: Option<(usize, usize, Moments)>,
-    sensor: &SensorConfig,
+    view: &Viewpoint<'_>,
     config: &SplitConfig,
     out: &mut Collector<'_>,
 ) {
     if let Some((from, to, moments)) = open
         && let Some(points) = cluster.get(from..to)
     {
-        finish(Piece { points, moments }, sensor, config, out);
+        finish(Piece { points, moments }, view, config, out);
     }
 }
 
 /// Index at which to cut: the point farthest from the chord, if any is more than `sigmas` standard deviations off.
-fn farthest_from_chord(points: &[ScanPoint], sensor: &SensorConfig, sigmas: f32) -> Option<usize> {
-    let (first, last) = (points.first()?, points.last()?);
-    let chord = last.position - first.position;
-    let length2 = chord.norm_squared();
+fn farthest_from_chord(points: &[ScanPoint], view: &Viewpoint<'_>, sigmas: f32) -> Option<usize> {
+    let first = points.first()?;
+    let normal = chord_normal(points)?;
     if points.len() < 3 {
         return None;
     }
-    let (mut worst, mut cut) = (sigmas * sigmas * length2, None);
+    let (mut worst, mut cut) = (sigmas * sigmas, None);
     for (i, point) in points.iter().enumerate().skip(1).take(points.len() - 2) {
-        let off = cross(chord, point.position - first.position);
-        let chi2 = off * off / sensor.noise.variance(point.range_m);
+        let off = normal.dot(&(point.position - first.position));
+        let chi2 = off * off / variance_across(point, normal, view);
         if chi2 > worst {
             (worst, cut) = (chi2, Some(i));
         }
     }
     cut
+}
+
+/// Unit normal of the line through the first and last point; `None` where they coincide.
+fn chord_normal(points: &[ScanPoint]) -> Option<Vector2<f32>> {
+    let chord = perpendicular(points.last()?.position - points.first()?.position);
+    let length = sqrt(chord.norm_squared());
+    (length > 0.0).then(|| chord / length)
+}
+
+/// Weighted sums over a run of points whose surface lies along its chord.
+fn chord_moments(points: &[ScanPoint], view: &Viewpoint<'_>) -> Moments {
+    // A run that ends where it began has no surface; x serves as well as any.
+    weighted_moments(points.iter(), chord_normal(points).unwrap_or_else(Vector2::x), view)
+}
+
+/// Sums over a run of points, each weighing the inverse of its variance across a surface with this normal.
+fn weighted_moments<'a>(
+    points: impl Iterator<Item = &'a ScanPoint> + Clone,
+    normal: Vector2<f32>,
+    view: &Viewpoint<'_>,
+) -> Moments {
+    Moments::from_points(points.map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
 }
 
 /// Whether two neighbouring pieces are one line: their common fit must not be worse than their own.
@@ -162,24 +182,42 @@ fn is_one_line(a: &Moments, b: &Moments, config: &SplitConfig) -> bool {
     cost <= (config.merge_chi2 * a.inliers.min(b.inliers) as f32).max(9.0)
 }
 
+/// Whether the line lies so near the end of the sensor's range at a point that farther readings of it were lost: what
+/// remains there is too near on average.
+fn beyond_sight(point: &ScanPoint, normal: Vector2<f32>, line: &Moments, view: &Viewpoint<'_>) -> bool {
+    let max_m = f32::from(view.sensor.codes.max_mm) * 1e-3;
+    if point.range_m < 0.8 * max_m {
+        return false;
+    }
+    let along_beam = normal.dot(&(point.position - view.position));
+    let to_line = normal.dot(&(line.centroid - view.position));
+    let line_range_m = point.range_m * to_line / along_beam;
+    let limit_m = max_m - 2.5 * sqrt(view.sensor.noise.variance(max_m));
+    line_range_m > limit_m
+}
+
 /// Trims the ends, tests and keeps a piece.
-fn finish(piece: Piece<'_>, sensor: &SensorConfig, config: &SplitConfig, out: &mut Collector<'_>) {
+fn finish(piece: Piece<'_>, view: &Viewpoint<'_>, config: &SplitConfig, out: &mut Collector<'_>) {
     if piece.moments.inliers < config.min_inliers {
         return;
     }
     let normal = perpendicular(piece.moments.direction());
     let off_line = |point: &ScanPoint| {
         let off = normal.dot(&(point.position - piece.moments.centroid));
-        off * off > config.trim_sigmas * config.trim_sigmas * sensor.noise.variance(point.range_m)
+        let limit = config.trim_sigmas * config.trim_sigmas * variance_across(point, normal, view);
+        off * off > limit || beyond_sight(point, normal, &piece.moments, view)
     };
     let leading = piece.points.iter().take_while(|p| off_line(p)).count();
     let trailing = piece.points.iter().rev().take_while(|p| off_line(p)).count();
     let Some(kept) = piece.points.get(leading..piece.points.len().saturating_sub(trailing)) else { return };
-    let moments =
-        if kept.len() == piece.points.len() { piece.moments } else { weighted_moments(kept, sensor) };
+    let on_line = |point: &&ScanPoint| {
+        let off = normal.dot(&(point.position - piece.moments.centroid));
+        off * off <= config.split_sigmas * config.split_sigmas * variance_across(point, normal, view)
+    };
+    let moments = weighted_moments(kept.iter().filter(on_line), normal, view);
     let (Some(first), Some(last)) = (kept.first(), kept.last()) else { return };
     let ends: [Point2<f32>; 2] = [first.position, last.position];
-    let segment = Segment::fitted(moments, &ends, viewpoint(sensor));
+    let segment = Segment::fitted(moments, &ends, view.position);
     let straight = moments.residual() <= config.max_mean_chi2 * moments.inliers as f32;
     let directed = moments.scatter_along(segment.direction)
         * config.max_sigma_direction_rad
