@@ -163,16 +163,8 @@ fn chord_normal(points: &[ScanPoint]) -> Option<Vector2<f32>> {
 /// Weighted sums over a run of points whose surface lies along its chord.
 fn chord_moments(points: &[ScanPoint], view: &Viewpoint<'_>) -> Moments {
     // A run that ends where it began has no surface; x serves as well as any.
-    weighted_moments(points.iter(), chord_normal(points).unwrap_or_else(Vector2::x), view)
-}
-
-/// Sums over a run of points, each weighing the inverse of its variance across a surface with this normal.
-fn weighted_moments<'a>(
-    points: impl Iterator<Item = &'a ScanPoint> + Clone,
-    normal: Vector2<f32>,
-    view: &Viewpoint<'_>,
-) -> Moments {
-    Moments::from_points(points.map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
+    let normal = chord_normal(points).unwrap_or_else(Vector2::x);
+    Moments::from_points(points.iter().map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
 }
 
 /// Whether two neighbouring pieces are one line: their common fit must not be worse than their own.
@@ -180,6 +172,31 @@ fn is_one_line(a: &Moments, b: &Moments, config: &SplitConfig) -> bool {
     let cost = a.merged(b).residual() - a.residual() - b.residual();
     // 9: the 99 % point of χ² with the two degrees of freedom that a second line has.
     cost <= (config.merge_chi2 * a.inliers.min(b.inliers) as f32).max(9.0)
+}
+
+/// Sums over the points of a line that is nearly known, free of two biases of a plain fit.
+///
+/// Range noise moves a point along its beam: off the line, and along it by an amount that depends on the first. Seen at an
+/// angle, that correlation turns a total-least-squares line by σ²·sinβ·cosβ over the variance along it, always the
+/// same way. So each point is taken where its beam meets the known line, off it by what it was off. And the noise is taken
+/// for the range of the known line: taken for the range measured, points too near would weigh more.
+fn refined(points: &[ScanPoint], line: &Moments, view: &Viewpoint<'_>, config: &SplitConfig) -> Moments {
+    let normal = perpendicular(line.direction());
+    let to_line = normal.dot(&(line.centroid - view.position));
+    let on_line = points.iter().filter_map(|point| {
+        let from_view = point.position - view.position;
+        let share = to_line / normal.dot(&from_view);
+        let known = ScanPoint {
+            position: view.position + from_view * share,
+            range_m: point.range_m * share,
+            ..*point
+        };
+        let off = normal.dot(&(point.position - line.centroid));
+        let variance = variance_across(&known, normal, view);
+        let stray = off * off > config.split_sigmas * config.split_sigmas * variance;
+        (variance.is_finite() && !stray).then(|| (known.position + normal * off, 1.0 / variance))
+    });
+    Moments::from_points(on_line)
 }
 
 /// Whether the line lies so near the end of the sensor's range at a point that farther readings of it were lost: what
@@ -210,11 +227,8 @@ fn finish(piece: Piece<'_>, view: &Viewpoint<'_>, config: &SplitConfig, out: &mu
     let leading = piece.points.iter().take_while(|p| off_line(p)).count();
     let trailing = piece.points.iter().rev().take_while(|p| off_line(p)).count();
     let Some(kept) = piece.points.get(leading..piece.points.len().saturating_sub(trailing)) else { return };
-    let on_line = |point: &&ScanPoint| {
-        let off = normal.dot(&(point.position - piece.moments.centroid));
-        off * off <= config.split_sigmas * config.split_sigmas * variance_across(point, normal, view)
-    };
-    let moments = weighted_moments(kept.iter().filter(on_line), normal, view);
+    let moments = refined(kept, &piece.moments, view, config);
+    let moments = refined(kept, &moments, view, config);
     let (Some(first), Some(last)) = (kept.first(), kept.last()) else { return };
     let ends: [Point2<f32>; 2] = [first.position, last.position];
     let segment = Segment::fitted(moments, &ends, view.position);
