@@ -80,7 +80,7 @@ impl Default for SlamConfig {
             odometry: OdometryConfig { integration: Integration::Arc, noise: ODOMETRY_NOISE },
             deskew: DeskewConfig { enabled: true },
             extraction: ExtractionConfig::Split(SplitConfig {
-                max_gap_m: 0.10,
+                max_gap_m: 0.05,
                 min_incidence_rad: 0.17,
                 max_missing_beams: 4,
                 split_sigmas: 4.0,
@@ -108,12 +108,12 @@ impl Default for SlamConfig {
                 search: SearchConfig { below_support: 0.8, gain: 0.1, step_rad: 0.1, reach_rad: 0.6 },
             }),
             loop_closure: Some(LoopConfig {
-                min_way_m: 10.0,
+                min_way_m: 20.0,
                 sigma_position_m_per_sqrt_m: 0.05,
                 sigma_heading_rad_per_sqrt_m: 0.004,
-                min_support: 0.4,
+                min_support: 0.6,
                 min_chi2: 9.0,
-                confirmations: 3,
+                confirmations: 4,
                 same_position_m: 0.1,
                 same_heading_rad: 0.03,
             }),
@@ -124,6 +124,7 @@ impl Default for SlamConfig {
                 fuse_max_angle_rad: 0.1,
                 fuse_max_distance_m: 0.25,
                 fuse_gap_m: 0.2,
+                fuse_max_gap_m: 2.0,
                 fuse_chi2: 9.2,
                 fuse_sigmas: 16.0,
                 fuse_overlap: 0.5,
@@ -250,6 +251,7 @@ impl SlamConfig {
             positive("registration.sums.fuse_max_distance_m", c.fuse_max_distance_m)?;
             positive("registration.sums.fuse_sigmas", c.fuse_sigmas)?;
             not_negative("registration.sums.fuse_gap_m", c.fuse_gap_m)?;
+            not_negative("registration.sums.fuse_max_gap_m", c.fuse_max_gap_m)?;
             positive("registration.sums.fuse_chi2", c.fuse_chi2)?;
             positive("registration.sums.fuse_overlap", c.fuse_overlap)?;
         }

@@ -44,8 +44,10 @@ pub struct SumsConfig {
     pub fuse_max_angle_rad: f32,
     /// Two map segments of which an end lies farther than this off the other's line are two walls, metres.
     pub fuse_max_distance_m: f32,
-    /// Two map segments with a wider gap between them, along, are two walls, metres.
+    /// Two map segments with a wider gap between them, along, are two walls, metres, …
     pub fuse_gap_m: f32,
+    /// … unless the gap is no longer than either, up to this, metres: a wall with a door in it.
+    pub fuse_max_gap_m: f32,
     /// Within these bounds, worst χ² of two map segments that are one wall.
     pub fuse_chi2: f32,
     /// Overlapping map segments closer than this many standard deviations of a line's offset are one wall whatever
@@ -215,7 +217,9 @@ fn one_wall(a: &MapSegment, b: &MapSegment, view: &View<'_>, config: &SumsConfig
         Residual::new(short, long, view.pose.translation.vector.into(), view.line_noise)
             .is_some_and(|r| r.chi2(&nalgebra::Matrix3::zeros()) <= config.fuse_chi2)
     };
-    hides || overlap_m >= -config.fuse_gap_m && agrees()
+    // A long wall goes on behind a door; a short thing beside another is another thing.
+    let gap_m = config.fuse_gap_m.max(short.length_m().min(config.fuse_max_gap_m));
+    hides || overlap_m >= -gap_m && agrees()
 }
 
 /// Distance of the farther end of `short` from the line of `long`, metres.
@@ -302,16 +306,26 @@ mod tests {
     fn one_wall_seen_in_pieces_becomes_one_segment() {
         let mut map = SegmentMap::new();
         let pieces =
-            [wall((0.0, 1.0), (1.0, 1.0)), wall((2.0, 1.002), (3.0, 1.0)), wall((5.0, 1.0), (6.0, 1.0))];
+            [wall((0.0, 1.0), (1.0, 1.0)), wall((2.5, 1.002), (3.5, 1.0)), wall((7.0, 1.0), (8.0, 1.0))];
         run(&mut map, &pieces, &[], 1, &sums());
         assert_eq!(map.segments().len(), 3);
         // A look at the middle closes the first gap, not the second.
-        run(&mut map, &[wall((0.5, 1.0), (2.5, 1.0))], &[Pair { observed: 0, mapped: 0 }], 2, &sums());
+        run(&mut map, &[wall((0.5, 1.0), (3.0, 1.0))], &[Pair { observed: 0, mapped: 0 }], 2, &sums());
         let mut lengths: StdVec<f32> = map.segments().iter().map(|s| s.segment.length_m()).collect();
         lengths.sort_by(f32::total_cmp);
         assert_eq!(lengths.len(), 2);
-        assert!((lengths[1] - 3.0).abs() < 1e-3);
+        assert!((lengths[1] - 3.5).abs() < 1e-3);
         assert_eq!(map.counters().fused, 1);
+    }
+
+    #[test]
+    fn a_wall_goes_on_behind_a_door_no_wider_than_it_is_long() {
+        let mut map = SegmentMap::new();
+        run(&mut map, &[wall((0.0, 1.0), (2.0, 1.0)), wall((2.9, 1.0), (5.0, 1.0))], &[], 1, &sums());
+        assert_eq!(map.segments().len(), 1);
+        let mut map = SegmentMap::new();
+        run(&mut map, &[wall((0.0, 1.0), (2.0, 1.0)), wall((2.9, 1.0), (3.2, 1.0))], &[], 1, &sums());
+        assert_eq!(map.segments().len(), 2, "a short thing behind the door is another thing");
     }
 
     #[test]

@@ -65,7 +65,7 @@ pub(crate) fn extract(
         let length = 1 + rest
             .iter()
             .zip(rest.iter().skip(1))
-            .take_while(|(a, b)| joined(a, b, config, spacing_per_m))
+            .take_while(|(a, b)| joined(a, b, view, config, spacing_per_m))
             .count();
         let (cluster, tail) = rest.split_at(length.min(rest.len()));
         split_cluster(cluster, view, config, out);
@@ -74,10 +74,18 @@ pub(crate) fn extract(
 }
 
 /// Whether two neighbouring points may lie on one surface.
-fn joined(a: &ScanPoint, b: &ScanPoint, config: &SplitConfig, spacing_per_m: f32) -> bool {
+fn joined(
+    a: &ScanPoint,
+    b: &ScanPoint,
+    view: &Viewpoint<'_>,
+    config: &SplitConfig,
+    spacing_per_m: f32,
+) -> bool {
     let beams = b.beam.saturating_sub(a.beam);
     let spacing_m = spacing_per_m * a.range_m.min(b.range_m) * f32::from(beams);
-    let limit_m = config.max_gap_m.max(spacing_m);
+    // Noise alone sets neighbours √2·σ apart along the beam; a wall must not end where it happens to.
+    let noise_m = config.split_sigmas * sqrt(2.0 * view.sensor.noise.variance(a.range_m.min(b.range_m)));
+    let limit_m = config.max_gap_m.max(spacing_m) + noise_m;
     beams <= config.max_missing_beams.saturating_add(1)
         && (b.position - a.position).norm_squared() <= limit_m * limit_m
 }
@@ -209,7 +217,7 @@ fn beyond_sight(point: &ScanPoint, normal: Vector2<f32>, line: &Moments, view: &
     let along_beam = normal.dot(&(point.position - view.position));
     let to_line = normal.dot(&(line.centroid - view.position));
     let line_range_m = point.range_m * to_line / along_beam;
-    let limit_m = max_m - 2.5 * sqrt(view.sensor.noise.variance(max_m));
+    let limit_m = max_m - 4.0 * sqrt(view.sensor.noise.variance(max_m));
     line_range_m > limit_m
 }
 
