@@ -2,7 +2,7 @@
 #![forbid(unsafe_code)]
 
 use std::io::IsTerminal;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -10,11 +10,13 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use comfy_table::{CellAlignment, Table, presets};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use lineslam::log::{self, Format, Log, ReadOptions};
-use lineslam::output::report::Report;
+use lineslam::output::report::{Report, SimulationReport};
 use lineslam::output::svg::Caption;
 use lineslam::output::{self, csv, grid, svg, tum};
 use lineslam::replay::{self, Replay, ReplayError};
 use lineslam::robot::{Robot, RobotError};
+use lineslam::sim::world::{Edge, World, WorldError};
+use lineslam::sim::{self, BadSetting, SimConfig, judge};
 use slam_core::SlamConfig;
 
 /// Line-segment SLAM, the same core as on the microcontroller.
@@ -29,6 +31,8 @@ struct Cli {
 enum Command {
     /// Turn a recorded log into a map and a trajectory.
     Replay(ReplayArgs),
+    /// Drive a simulated robot through a world and see how well it maps it.
+    Simulate(SimulateArgs),
 }
 
 #[derive(Args)]
@@ -50,6 +54,29 @@ struct ReplayArgs {
     /// Skip and count records that cannot be read, instead of stopping at the first.
     #[arg(long)]
     lenient: bool,
+}
+
+#[derive(Args)]
+struct SimulateArgs {
+    /// World file: walls, things, people, and the robot's path.
+    world: PathBuf,
+    /// Seed of all noise; the same seed gives the same drive.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Robot file. By default paper.toml.
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Which algorithm: the best we know, or the paper step for step.
+    #[arg(long, value_enum, default_value_t = Configuration::Default)]
+    config: Configuration,
+    /// Folder for all that replay writes, and for log.dat, which replay reads, and truth.tum.
+    #[arg(long, value_name = "FOLDER", default_value = "out")]
+    out: PathBuf,
+    /// Change an error of the simulated robot: wheel.radius_error, wheel.radius_difference, wheel.track_error,
+    /// wheel.slip_m_per_sqrt_m, sensor.sigma_m, sensor.sigma_per_m, sensor.uniform_m, sensor.dropout,
+    /// sensor.mixed_pixels, sensor.least_incidence, sensor.skip_every, sensor.delay_s.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -75,13 +102,19 @@ impl Configuration {
 }
 
 fn main() -> ExitCode {
-    let Command::Replay(args) = Cli::parse().command;
-    match replay(&args) {
+    let done = match Cli::parse().command {
+        Command::Replay(args) => replay(&args),
+        Command::Simulate(args) => simulate(&args),
+    };
+    match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            let bad_input =
-                error.is::<log::LogError>() || error.is::<RobotError>() || error.is::<ReplayError>();
+            let bad_input = error.is::<log::LogError>()
+                || error.is::<RobotError>()
+                || error.is::<ReplayError>()
+                || error.is::<WorldError>()
+                || error.is::<BadSetting>();
             ExitCode::from(if bad_input { 2 } else { 1 })
         }
     }
@@ -92,34 +125,62 @@ fn replay(args: &ReplayArgs) -> anyhow::Result<()> {
     let given = args.robot.as_deref().map(Robot::load).transpose()?;
     let options = |beams| ReadOptions { format: args.format, beams, lenient: args.lenient };
     let log = log::read(&args.log, &options(given.as_ref().and_then(Robot::beams)))?;
-    let robot = match given {
-        Some(robot) => robot,
-        None => Robot::usual_for(log.format),
-    };
-    let progress = progress_bar(log.scans.len());
-    let result = replay::run(&log, &robot, args.config.config(), || progress.inc(1))?;
-    progress.finish_and_clear();
+    let robot = given.unwrap_or_else(|| Robot::usual_for(log.format));
+    let result = run(&log, &robot, args.config)?;
     let report = Report::new(&log, &robot, args.config.name(), &result);
-    write(args, &result, &report)?;
-    print_summary(args, &log, &report);
+    let name = args.log.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+    let files = results(&result, &report, &name, &[])?;
+    output::write_all(&args.out, &files)?;
+    print_summary("log", &args.log.display().to_string(), &args.out, &report);
     Ok(())
 }
 
-fn write(args: &ReplayArgs, result: &Replay, report: &Report) -> anyhow::Result<()> {
-    let name = args.log.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-    let caption = Caption { log: &name, configuration: args.config.name() };
+fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
+    let world = World::load(&args.world)?;
+    let robot = args.robot.as_deref().map_or_else(|| Ok(Robot::usual_for("simulated")), Robot::load)?;
+    let mut errors = SimConfig::default();
+    for setting in &args.settings {
+        errors.set(setting)?;
+    }
+    let drive = sim::drive(&world, &robot, &errors, args.seed)?;
+    let result = run(&drive.log, &robot, args.config)?;
+    let mut report = Report::new(&drive.log, &robot, args.config.name(), &result);
+    report.simulation = Some(SimulationReport::new(&world, &drive, &result, args.seed, errors));
+    let caption = format!("{}, seed {}", world.name, args.seed);
+    let mut files = results(&result, &report, &caption, &judge::blueprint_in_map(&world, &drive))?;
+    files.push(("log.dat", sim::mines_text(&drive.log).into_bytes()));
+    let stamps = drive.log.scans.iter().map(|s| s.stamp_us);
+    files.push(("truth.tum", tum::render_f64(stamps.zip(&drive.truth)).into_bytes()));
+    output::write_all(&args.out, &files)?;
+    print_summary("world", &caption, &args.out, &report);
+    Ok(())
+}
+
+fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Replay, ReplayError> {
+    let progress = progress_bar(log.scans.len());
+    let result = replay::run(log, robot, configuration.config(), || progress.inc(1))?;
+    progress.finish_and_clear();
+    Ok(result)
+}
+
+/// The files that every run leaves behind.
+fn results(
+    result: &Replay,
+    report: &Report,
+    name: &str,
+    blueprint: &[Edge],
+) -> anyhow::Result<Vec<(&'static str, Vec<u8>)>> {
+    let caption = Caption { log: name, configuration: &report.configuration };
     let grid = grid::render(&result.steps).context("map.pgm")?;
-    let files = [
+    Ok(vec![
         ("trajectory.tum", tum::render(replay::trajectory(&result.steps)).into_bytes()),
         ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),
         ("map.csv", csv::render(&result.map).context("map.csv")?),
-        ("map.svg", svg::render(result, &caption).into_bytes()),
+        ("map.svg", svg::render(result, &caption, blueprint).into_bytes()),
         ("map.pgm", grid.pgm),
         ("map.yaml", grid.yaml.into_bytes()),
         ("report.json", report.render().context("report.json")?),
-    ];
-    output::write_all(&args.out, &files)?;
-    Ok(())
+    ])
 }
 
 /// A bar on a terminal, nothing in a pipe.
@@ -134,15 +195,20 @@ fn progress_bar(scans: usize) -> ProgressBar {
     ProgressBar::with_draw_target(Some(scans as u64), target).with_style(style)
 }
 
-fn print_summary(args: &ReplayArgs, log: &Log, report: &Report) {
+fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
-    let skipped = match log.skipped.values().sum::<usize>() {
+    let skipped = match report.records_skipped.values().sum::<usize>() {
         0 => "none".to_owned(),
-        _ => log.skipped.iter().map(|(reason, n)| format!("{n} {reason}")).collect::<Vec<_>>().join(", "),
+        _ => report
+            .records_skipped
+            .iter()
+            .map(|(reason, n)| format!("{n} {reason}"))
+            .collect::<Vec<_>>()
+            .join(", "),
     };
-    for (what, value) in [
-        ("log", format!("{} ({})", args.log.display(), report.format)),
+    let mut rows = vec![
+        (source, format!("{name} ({})", report.format)),
         ("robot, configuration", format!("{}, {}", report.robot, report.configuration)),
         ("scans used", report.scans_used.to_string()),
         ("records skipped", skipped),
@@ -156,8 +222,12 @@ fn print_summary(args: &ReplayArgs, log: &Log, report: &Report) {
             ),
         ),
         ("RAM of Slam", format!("{} bytes", report.slam_bytes)),
-        ("written to", args.out.display().to_string()),
-    ] {
+    ];
+    if let Some(simulation) = &report.simulation {
+        rows.extend(simulation.rows());
+    }
+    rows.push(("written to", out.display().to_string()));
+    for (what, value) in rows {
         table.add_row([what.to_owned(), value]);
     }
     if let Some(column) = table.column_mut(0) {

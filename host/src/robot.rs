@@ -155,10 +155,12 @@ impl Robot {
         Self::parse(&text, path)
     }
 
-    /// The robot that a format's logs were recorded with, built in: `robots/mines.toml` or `robots/sick.toml`.
+    /// The robot that a format's logs were recorded with, built in: `robots/mines.toml`, `robots/sick.toml`, or
+    /// `robots/paper.toml` for simulated ones.
     pub fn usual_for(format: &str) -> Self {
         let (text, name) = match format {
             "mines" => (include_str!("../../robots/mines.toml"), "robots/mines.toml"),
+            "simulated" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
             _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
         };
         Self::parse(text, Path::new(name)).expect("the built-in robots are tested")

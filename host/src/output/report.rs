@@ -12,6 +12,9 @@ use slam_core::slam::Counters;
 use crate::log::Log;
 use crate::replay::Replay;
 use crate::robot::Robot;
+use crate::sim::judge::{self, Judgement, TrajectoryErrors};
+use crate::sim::world::World;
+use crate::sim::{Drive, SimConfig};
 
 /// Everything the file says.
 #[derive(Debug, Serialize)]
@@ -44,8 +47,56 @@ pub struct Report {
     pub slam_bytes: usize,
     /// Room for map segments.
     pub map_capacity: usize,
+    /// What only a simulation can say.
+    #[serde(flatten)]
+    pub simulation: Option<SimulationReport>,
     /// Every setting.
     pub config: SlamConfig,
+}
+
+/// The truth's word on a simulated drive.
+#[derive(Debug, Serialize)]
+pub struct SimulationReport {
+    /// Name of the world.
+    pub world: String,
+    /// Seed of all noise.
+    pub seed: u64,
+    /// Errors of the simulated robot.
+    pub errors: SimConfig,
+    /// Measures of map and trajectory.
+    #[serde(flatten)]
+    pub judgement: Judgement,
+    /// Measures of dead reckoning, which has no map.
+    pub dead_reckoning: TrajectoryErrors,
+}
+
+impl SimulationReport {
+    /// Judges a replay of a simulated drive.
+    pub fn new(world: &World, drive: &Drive, replay: &Replay, seed: u64, errors: SimConfig) -> Self {
+        let odometry = judge::in_world(drive, replay.steps.iter().map(|s| s.odometry));
+        Self {
+            world: world.name.clone(),
+            seed,
+            errors,
+            judgement: judge::judge(world, drive, replay),
+            dead_reckoning: judge::trajectory_errors(&drive.truth, &odometry),
+        }
+    }
+
+    /// Lines for a summary.
+    pub fn rows(&self) -> Vec<(&'static str, String)> {
+        let (j, dead) = (&self.judgement, &self.dead_reckoning);
+        let corners = match j.corner_error_m {
+            Some(error_m) => format!("{error_m:.3} m, {} of {} found", j.corners_found, j.corners),
+            None => format!("none of {} found", j.corners),
+        };
+        let beside = |ours: f64, theirs: f64| format!("{ours:.3} m, dead reckoning {theirs:.3} m");
+        vec![
+            ("corner error, eq. (11)", corners),
+            ("trajectory error, rmse", beside(j.ate_rmse_m, dead.ate_rmse_m)),
+            ("final position error", beside(j.final_position_error_m, dead.final_position_error_m)),
+        ]
+    }
 }
 
 /// Microseconds, measured on this machine.
@@ -99,6 +150,7 @@ impl Report {
             map_counters: replay.map_counters,
             slam_bytes: replay.slam_bytes,
             map_capacity: crate::replay::MAP_SEGMENTS,
+            simulation: None,
             config: replay.config,
         }
     }

@@ -12,6 +12,7 @@ use svg::Document;
 use svg::node::element::{Circle, Group, Line, Path, Rectangle, Text};
 
 use crate::replay::Replay;
+use crate::sim::world::Edge;
 
 const PAPER: &str = "#fbfaf7";
 const INK: &str = "#1d2b3a";
@@ -19,6 +20,7 @@ const FAINT: &str = "#8fa3b5";
 const WALL: &str = "#16324f";
 const PATH: &str = "#d1495b";
 const ODOMETRY: &str = "#edae49";
+const BLUEPRINT: &str = "#cfe3d8";
 const START: &str = "#2a9d8f";
 const FONT: &str = "Inter, Helvetica, Arial, sans-serif";
 
@@ -29,7 +31,7 @@ const LONG_EDGE_PX: f32 = 1400.0;
 const MARGIN_PX: f32 = 36.0;
 const HEADER_PX: f32 = 74.0;
 const FOOTER_PX: f32 = 58.0;
-const LEAST_WIDTH_PX: f32 = 1090.0;
+const LEAST_WIDTH_PX: f32 = 1200.0;
 /// Scan points are thinned to one a cell of this size, metres, and drawn up to this range.
 const POINT_CELL_M: f32 = 0.04;
 
@@ -52,7 +54,7 @@ struct View {
 }
 
 impl View {
-    fn around(replay: &Replay) -> Self {
+    fn around(replay: &Replay, blueprint: &[Edge]) -> Self {
         let mut points: Vec<Point2<f32>> = Vec::new();
         points.extend(
             replay
@@ -61,6 +63,7 @@ impl View {
                 .filter(|s| s.hits >= ESTABLISHED_HITS)
                 .flat_map(|s| [s.segment.start, s.segment.end]),
         );
+        points.extend(blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
         points.extend(replay.steps.iter().map(|s| Point2::from(s.pose_in_final_map.translation.vector)));
         let (mut low, mut high) = (Point2::new(f32::MAX, f32::MAX), Point2::new(f32::MIN, f32::MIN));
         for p in &points {
@@ -91,9 +94,9 @@ impl View {
     }
 }
 
-/// Renders the drawing.
-pub fn render(replay: &Replay, caption: &Caption<'_>) -> String {
-    let view = View::around(replay);
+/// Renders the drawing, over the blueprint where there is one.
+pub fn render(replay: &Replay, caption: &Caption<'_>, blueprint: &[Edge]) -> String {
+    let view = View::around(replay, blueprint);
     let document = Document::new()
         .set("viewBox", (0, 0, view.width_px.round() as i32, view.height_px.round() as i32))
         .set("width", view.width_px.round())
@@ -101,12 +104,13 @@ pub fn render(replay: &Replay, caption: &Caption<'_>) -> String {
         .set("font-family", FONT)
         .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", PAPER))
         .add(metre_grid(&view))
+        .add(blueprint_lines(blueprint, &view))
         .add(scan_points(replay, &view))
         .add(dead_reckoning(replay, &view))
         .add(walls(&replay.map, &view))
         .add(path(replay, &view))
         .add(header(replay, caption, &view))
-        .add(footer(&view));
+        .add(footer(!blueprint.is_empty(), &view));
     format!("{document}\n")
 }
 
@@ -128,6 +132,17 @@ fn metre_grid(view: &View) -> Group {
     }
     Group::new()
         .add(Path::new().set("d", d).set("stroke", "#e9e5dc").set("stroke-width", 1).set("fill", "none"))
+}
+
+fn blueprint_lines(blueprint: &[Edge], view: &View) -> Path {
+    let mut d = String::new();
+    for edge in blueprint {
+        let ((x1, y1), (x2, y2)) = (view.px(edge.from.map(|v| v as f32)), view.px(edge.to.map(|v| v as f32)));
+        let _ = write!(d, "M{x1} {y1}L{x2} {y2}");
+    }
+    let width = 1.6 * wall_width(view);
+    let path = Path::new().set("d", d).set("stroke", BLUEPRINT).set("stroke-width", width);
+    path.set("stroke-linecap", "round").set("fill", "none")
 }
 
 fn scan_points(replay: &Replay, view: &View) -> Path {
@@ -275,7 +290,7 @@ fn header(replay: &Replay, caption: &Caption<'_>, view: &View) -> Group {
 }
 
 /// Scale bar on the left, legend on the right.
-fn footer(view: &View) -> Group {
+fn footer(has_blueprint: bool, view: &View) -> Group {
     let y = view.height_px - 24.0;
     let metres = scale_step(view);
     let length_px = metres * view.px_per_m;
@@ -283,7 +298,7 @@ fn footer(view: &View) -> Group {
     let mut group = Group::new()
         .add(Path::new().set("d", bar).set("stroke", INK).set("stroke-width", 2).set("fill", "none"))
         .add(label(MARGIN_PX + length_px + 10.0, y + 2.0, 15, format!("{metres} m")));
-    let entries: [(&str, &str, f32, &str, f32); 6] = [
+    let mut entries = vec![
         ("start", START, 0.0, "", 62.0),
         ("path", PATH, 2.2, "", 62.0),
         ("dead reckoning", ODOMETRY, 2.0, "7 5", 136.0),
@@ -291,6 +306,9 @@ fn footer(view: &View) -> Group {
         ("seen once or twice", WALL, 0.4 * wall_width(view), "", 164.0),
         ("scan points", FAINT, 2.0, "0.5 5", 100.0),
     ];
+    if has_blueprint {
+        entries.push(("blueprint", BLUEPRINT, 8.0, "", 80.0));
+    }
     let mut x = view.width_px - MARGIN_PX - entries.iter().map(|e| e.4 + 32.0).sum::<f32>() + 14.0;
     for (name, colour, width, dashes, text_px) in entries {
         group = if width > 0.0 {

@@ -10,11 +10,24 @@ pub fn render<'a>(poses: impl Iterator<Item = (u64, &'a Isometry2<f32>)>) -> Str
     let mut text = String::new();
     for (stamp_us, pose) in poses {
         let c = components(pose);
-        let half = 0.5 * f64::from(c.z);
-        let (qz, qw) = half.sin_cos();
-        let (seconds, micros) = (stamp_us / 1_000_000, stamp_us % 1_000_000);
-        // Writing to a String cannot fail.
-        let _ = writeln!(text, "{seconds}.{micros:06} {:.6} {:.6} 0 0 0 {qz:.9} {qw:.9}", c.x, c.y);
+        line(&mut text, stamp_us, c.x.into(), c.y.into(), c.z.into());
     }
     text
+}
+
+/// The same for poses of twice the digits.
+pub fn render_f64<'a>(poses: impl Iterator<Item = (u64, &'a Isometry2<f64>)>) -> String {
+    let mut text = String::new();
+    for (stamp_us, pose) in poses {
+        line(&mut text, stamp_us, pose.translation.x, pose.translation.y, pose.rotation.angle());
+    }
+    text
+}
+
+fn line(text: &mut String, stamp_us: u64, x_m: f64, y_m: f64, theta_rad: f64) {
+    let half = 0.5 * theta_rad;
+    let (qz, qw) = (libm::sin(half), libm::cos(half));
+    let (seconds, micros) = (stamp_us / 1_000_000, stamp_us % 1_000_000);
+    // Writing to a String cannot fail.
+    let _ = writeln!(text, "{seconds}.{micros:06} {x_m:.6} {y_m:.6} 0 0 0 {qz:.9} {qw:.9}");
 }

@@ -111,6 +111,13 @@ pub fn map_in_world(drive: &Drive, map: &[MapSegment]) -> Vec<MapSegment> {
         .collect()
 }
 
+/// The straight surfaces of the blueprint in the map's frame.
+pub fn blueprint_in_map(world: &World, drive: &Drive) -> Vec<Edge> {
+    let map_from_world = drive.truth.first().map_or_else(Isometry2::identity, Isometry2::inverse);
+    let carried = |e: Edge| Edge { from: map_from_world * e.from, to: map_from_world * e.to, ..e };
+    world.edges().into_iter().map(carried).collect()
+}
+
 /// Normalised estimation error squared of pose `k`: eᵀP⁻¹e.
 fn normalised_error(drive: &Drive, replay: &Replay, poses: &[Isometry2<f64>], k: usize) -> Option<f64> {
     let (truth, pose, step) = (drive.truth.get(k)?, poses.get(k)?, replay.steps.get(k)?);

@@ -124,8 +124,36 @@ impl SimConfig {
         let (table, name) = key.split_once('.').ok_or_else(unknown)?;
         let slot = all.get_mut(table).and_then(toml::Value::as_table_mut).and_then(|t| t.get_mut(name));
         *slot.ok_or_else(unknown)? = value;
-        *self = all.try_into().map_err(|e| bad(e.to_string()))?;
+        let changed: Self = all.try_into().map_err(|e| bad(e.to_string()))?;
+        changed.check().map_err(bad)?;
+        *self = changed;
         Ok(())
+    }
+}
+
+impl SimConfig {
+    /// Says which value no robot can have.
+    fn check(&self) -> Result<(), String> {
+        let share = |name: &str, value: f64| {
+            if (0.0..=1.0).contains(&value) { Ok(()) } else { Err(format!("{name} is not within 0 to 1")) }
+        };
+        let small = |name: &str, value: f64| {
+            if value.abs() < 0.5 { Ok(()) } else { Err(format!("{name} is not within ±0.5")) }
+        };
+        let not_negative = |name: &str, value: f64| {
+            if value >= 0.0 { Ok(()) } else { Err(format!("{name} is below zero")) }
+        };
+        small("wheel.radius_error", self.wheel.radius_error)?;
+        small("wheel.radius_difference", self.wheel.radius_difference)?;
+        small("wheel.track_error", self.wheel.track_error)?;
+        not_negative("wheel.slip_m_per_sqrt_m", self.wheel.slip_m_per_sqrt_m)?;
+        not_negative("sensor.sigma_m", self.sensor.sigma_m)?;
+        not_negative("sensor.sigma_per_m", self.sensor.sigma_per_m)?;
+        not_negative("sensor.uniform_m", self.sensor.uniform_m)?;
+        share("sensor.dropout", self.sensor.dropout)?;
+        share("sensor.mixed_pixels", self.sensor.mixed_pixels)?;
+        share("sensor.least_incidence", self.sensor.least_incidence)?;
+        not_negative("sensor.delay_s", self.sensor.delay_s)
     }
 }
 

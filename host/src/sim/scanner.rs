@@ -89,8 +89,8 @@ impl Scanner {
     }
 }
 
-/// Distance of a point from an edge.
-pub(super) fn distance_to(edge: &Edge, point: Point2<f64>) -> f64 {
+/// Distance of a point from an edge, metres.
+pub fn distance_to(edge: &Edge, point: Point2<f64>) -> f64 {
     let along = edge.to - edge.from;
     let share = ((point - edge.from).dot(&along) / along.norm_squared().max(1e-12)).clamp(0.0, 1.0);
     (edge.from + along * share - point).norm()

@@ -1,0 +1,209 @@
+//! `lineslam simulate` and the simulator behind it: the same seed gives the same bytes, the log reads back, and what is
+//! simulated is what was asked for.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use lineslam::log::{self, Format, Odometry, ReadOptions};
+use lineslam::robot::Robot;
+use lineslam::sim::world::World;
+use lineslam::sim::{SimConfig, drive};
+
+fn worlds() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../worlds")
+}
+
+fn world(name: &str) -> World {
+    World::load(&worlds().join(name)).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn robot() -> Robot {
+    Robot::usual_for("simulated")
+}
+
+fn simulate(out: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_lineslam"))
+        .arg("simulate")
+        .args(arguments)
+        .arg("--out")
+        .arg(out)
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn every_world_is_good_and_its_path_is_driven_to_the_end() {
+    for entry in std::fs::read_dir(worlds()).unwrap() {
+        let path = entry.unwrap().path();
+        let world = World::load(&path).unwrap_or_else(|e| panic!("{e}"));
+        let drive = drive(&world, &robot(), &SimConfig::default(), 1).unwrap();
+        let [x, y] = *world.path.points.last().unwrap();
+        let end = drive.truth.last().unwrap().translation.vector;
+        assert!((end - nalgebra::Vector2::new(x, y)).norm() < 0.25, "{}: ends at {end}", path.display());
+        // No wall is driven through: the robot keeps a hand's breadth from everything.
+        let edges = world.edges();
+        let clearance = drive.truth.iter().map(|pose| {
+            let at = nalgebra::Point2::from(pose.translation.vector);
+            edges.iter().map(|e| lineslam::sim::scanner::distance_to(e, at)).fold(f64::INFINITY, f64::min)
+        });
+        assert!(clearance.fold(f64::INFINITY, f64::min) > 0.1, "{}", path.display());
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let world = worlds().join("hall_quarter.toml");
+    let world = world.to_str().unwrap();
+    let log = |name: &str, seed: &str| {
+        let out = folder.path().join(name);
+        let output = simulate(&out, &[world, "--seed", seed]);
+        assert!(output.status.success(), "{output:?}");
+        (std::fs::read(out.join("log.dat")).unwrap(), std::fs::read(out.join("trajectory.tum")).unwrap())
+    };
+    assert_eq!(log("a", "5"), log("b", "5"));
+    assert_ne!(log("a", "5").0, log("c", "6").0);
+}
+
+#[test]
+fn the_log_replays_to_the_same_trajectory() {
+    let folder = tempfile::tempdir().unwrap();
+    let (first, second) = (folder.path().join("first"), folder.path().join("second"));
+    let world = worlds().join("hall_quarter.toml");
+    assert!(simulate(&first, &[world.to_str().unwrap()]).status.success());
+    let robot = Path::new(env!("CARGO_MANIFEST_DIR")).join("../robots/paper.toml");
+    let output = Command::new(env!("CARGO_BIN_EXE_lineslam"))
+        .args(["replay".as_ref(), first.join("log.dat").as_os_str(), "--robot".as_ref(), robot.as_os_str()])
+        .arg("--out")
+        .arg(&second)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let read = |folder: &Path| std::fs::read_to_string(folder.join("trajectory.tum")).unwrap();
+    assert_eq!(read(&first), read(&second));
+}
+
+#[test]
+fn the_report_has_the_truth_s_word() {
+    let folder = tempfile::tempdir().unwrap();
+    let world = worlds().join("hall_quarter.toml");
+    let output = simulate(folder.path(), &[world.to_str().unwrap(), "--set", "sensor.dropout=0.05"]);
+    assert!(output.status.success(), "{output:?}");
+    let text = std::fs::read(folder.path().join("report.json")).unwrap();
+    let report: serde_json::Value = serde_json::from_slice(&text).unwrap();
+    for key in ["corner_error_m", "ate_rmse_m", "final_position_error_m"] {
+        let value = report[key].as_f64().unwrap_or_else(|| panic!("no {key}"));
+        assert!(value > 0.0 && value < 0.1, "{key} = {value}");
+    }
+    assert!(
+        report["dead_reckoning"]["ate_rmse_m"].as_f64().unwrap() > report["ate_rmse_m"].as_f64().unwrap()
+    );
+    assert_eq!(report["errors"]["sensor"]["dropout"], 0.05);
+    assert_eq!(report["world"], "hall_quarter");
+    let truth = std::fs::read_to_string(folder.path().join("truth.tum")).unwrap();
+    assert_eq!(truth.lines().count() as u64, report["scans_used"].as_u64().unwrap());
+}
+
+#[test]
+fn bad_settings_and_worlds_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let hall = worlds().join("hall_quarter.toml");
+    let hall = hall.to_str().unwrap();
+    let refused = |arguments: &[&str], words: &[&str]| {
+        let output = simulate(&out, arguments);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(words.iter().all(|w| said.contains(w)), "{words:?} are not in: {said}");
+        assert!(!out.exists());
+    };
+    refused(&[hall, "--set", "wheel.colour=1"], &["wheel.colour=1", "no key 'wheel.colour'"]);
+    refused(&[hall, "--set", "wheel.radius_error"], &["wheel.radius_error", "key=value"]);
+    refused(&[hall, "--set", "sensor.dropout=often"], &["sensor.dropout=often", "not a number"]);
+    refused(&[hall, "--set", "sensor.dropout=7"], &["sensor.dropout=7"]);
+    refused(&["nowhere.toml"], &["nowhere.toml"]);
+    let good = std::fs::read_to_string(hall).unwrap();
+    for (from, to, words) in [
+        ("name = ", "nam = ", ["nam", "bad.toml"]),
+        ("radius = 0.25", "radius = -1", ["pillar 1: radius", "bad.toml"]),
+        ("at = [0, 0]", "at = [3.3, 3.3]", ["corner 'a'", "no two walls"]),
+    ] {
+        let bad = folder.path().join("bad.toml");
+        assert!(good.contains(from));
+        std::fs::write(&bad, good.replacen(from, to, 1)).unwrap();
+        refused(&[bad.to_str().unwrap()], &words);
+    }
+}
+
+#[test]
+fn counters_wrap_scans_go_missing_and_ticks_lie_as_asked() {
+    let world = world("hall_quarter.toml");
+    let plain = drive(&world, &robot(), &SimConfig::default(), 1).unwrap();
+    let ticks: Vec<i64> = plain
+        .log
+        .odometry
+        .iter()
+        .map(|(_, o)| match o {
+            Odometry::Ticks([left, _]) => *left,
+            Odometry::Pose(_) => unreachable!("the simulated robot counts ticks"),
+        })
+        .collect();
+    assert!(ticks.iter().all(|t| (0..65_536).contains(t)));
+    assert!(ticks.windows(2).any(|w| w[1] < w[0] - 60_000), "16-bit counters wrap on this drive");
+
+    let mut config = SimConfig::default();
+    config.set("sensor.skip_every=5").unwrap();
+    let gaps = drive(&world, &robot(), &config, 1).unwrap();
+    let (all, some) = (plain.log.scans.len(), gaps.log.scans.len());
+    assert!((some as f64 / all as f64 - 0.8).abs() < 0.01, "{some} of {all} scans");
+
+    let mut config = SimConfig::default();
+    config.set("wheel.radius_error=0.03").unwrap();
+    config.set("wheel.radius_difference=0").unwrap();
+    let ([left, right], _) = drive(&world, &robot(), &config, 1).unwrap().true_wheels;
+    assert!(
+        (left - right).abs() < 1e-12 && ((left / 0.05 - 1.0).abs() - 0.03).abs() < 1e-6,
+        "{left} {right}"
+    );
+}
+
+/// Noise of the ranges is that of the model: σ of 10 mm up to 1 m, 1 % of the range beyond.
+#[test]
+fn range_noise_is_the_model_s() {
+    let text = "name = \"wall\"\n[[wall]]\npoints = [[2, -50], [2, 50]]\n[path]\nheading_deg = 90\nspeed = 0.2\npoints = [[0, 0], [0, 1]]\n";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("wall.toml");
+    std::fs::write(&path, text).unwrap();
+    let world = World::load(&path).unwrap();
+    let mut config = SimConfig::default();
+    for quiet in ["sensor.dropout=0", "sensor.mixed_pixels=0"] {
+        config.set(quiet).unwrap();
+    }
+    let drive = drive(&world, &robot(), &config, 3).unwrap();
+    // The beam at −90° (256 steps right of the front) meets the wall at 2 m.
+    let beam = 384 - 44 - 256;
+    let straight: Vec<f64> = drive
+        .log
+        .scans
+        .iter()
+        .zip(&drive.truth)
+        .filter(|(_, t)| (t.rotation.angle() - std::f64::consts::FRAC_PI_2).abs() < 1e-3)
+        .map(|(s, t)| f64::from(s.ranges_mm[beam]) * 1e-3 - (2.0 - t.translation.x))
+        .collect();
+    let n = straight.len() as f64;
+    assert!(n > 30.0);
+    let rms = (straight.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+    assert!((0.013..0.028).contains(&rms), "σ is {rms} m at 2 m");
+}
+
+#[test]
+fn a_written_log_is_a_mines_log() {
+    let drive = drive(&world("parallel.toml"), &robot(), &SimConfig::default(), 2).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("log.dat");
+    std::fs::write(&path, lineslam::sim::mines_text(&drive.log)).unwrap();
+    let options = ReadOptions { format: Format::Auto, beams: robot().beams(), lenient: false };
+    let read = log::read(&path, &options).unwrap();
+    assert_eq!(read.odometry, drive.log.odometry);
+    assert_eq!(read.scans, drive.log.scans);
+}
