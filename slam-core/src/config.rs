@@ -8,6 +8,7 @@ use crate::deskew::DeskewConfig;
 use crate::extraction::{ExtractionConfig, RansacConfig, SplitConfig};
 use crate::loop_closure::LoopConfig;
 use crate::odometry::{Integration, OdometryNoise};
+use crate::odometry_bias::BiasConfig;
 use crate::registration::{RegistrationConfig, SumsConfig};
 use crate::residual::LineNoise;
 use crate::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
@@ -21,6 +22,8 @@ pub struct OdometryConfig {
     pub integration: Integration,
     /// Growth of uncertainty.
     pub noise: OdometryNoise,
+    /// Learning of systematic errors, or none.
+    pub bias: Option<BiasConfig>,
 }
 
 /// Everything [`Slam`](crate::Slam) can be told.
@@ -77,7 +80,16 @@ impl Default for SlamConfig {
     fn default() -> Self {
         Self {
             sensor: PAPER_SENSOR,
-            odometry: OdometryConfig { integration: Integration::Arc, noise: ODOMETRY_NOISE },
+            odometry: OdometryConfig {
+                integration: Integration::Arc,
+                noise: ODOMETRY_NOISE,
+                bias: Some(BiasConfig {
+                    sigma_distance: 0.015,
+                    sigma_turn: 0.01,
+                    sigma_turn_per_m: 0.005,
+                    most_sigmas: 3.0,
+                }),
+            },
             deskew: DeskewConfig { enabled: true },
             extraction: ExtractionConfig::Split(SplitConfig {
                 max_gap_m: 0.05,
@@ -124,8 +136,8 @@ impl Default for SlamConfig {
                 fuse_max_angle_rad: 0.1,
                 fuse_max_distance_m: 0.25,
                 fuse_gap_m: 0.2,
-                fuse_max_gap_m: 2.0,
-                fuse_chi2: 9.2,
+                fuse_max_gap_m: 1.0,
+                fuse_chi2: 4.0,
                 fuse_sigmas: 16.0,
                 fuse_overlap: 0.5,
             }),
@@ -138,7 +150,7 @@ impl SlamConfig {
     pub fn paper() -> Self {
         Self {
             sensor: PAPER_SENSOR,
-            odometry: OdometryConfig { integration: Integration::Euler, noise: ODOMETRY_NOISE },
+            odometry: OdometryConfig { integration: Integration::Euler, noise: ODOMETRY_NOISE, bias: None },
             deskew: DeskewConfig { enabled: false },
             extraction: ExtractionConfig::Ransac(RansacConfig {
                 draws: 50,               // ours
@@ -188,7 +200,14 @@ impl SlamConfig {
         not_negative("odometry.noise.sigma_heading_rad_per_sqrt_rad", n.sigma_heading_rad_per_sqrt_rad)?;
         // The prior is inverted: at rest these are all there is.
         positive("odometry.noise.sigma_position_floor_m", n.sigma_position_floor_m)?;
-        positive("odometry.noise.sigma_heading_floor_rad", n.sigma_heading_floor_rad)
+        positive("odometry.noise.sigma_heading_floor_rad", n.sigma_heading_floor_rad)?;
+        if let Some(b) = &self.odometry.bias {
+            not_negative("odometry.bias.sigma_distance", b.sigma_distance)?;
+            not_negative("odometry.bias.sigma_turn", b.sigma_turn)?;
+            not_negative("odometry.bias.sigma_turn_per_m", b.sigma_turn_per_m)?;
+            not_negative("odometry.bias.most_sigmas", b.most_sigmas)?;
+        }
+        Ok(())
     }
 
     fn validate_stages(&self) -> Result<(), ConfigError> {

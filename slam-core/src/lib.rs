@@ -74,6 +74,7 @@ pub mod loop_closure;
 pub mod map;
 pub mod math;
 pub mod odometry;
+pub mod odometry_bias;
 pub mod odometry_track;
 pub mod pose;
 pub mod registration;

@@ -15,6 +15,7 @@ use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, SegmentMap};
 use crate::math::{sqrt, wrap_angle};
 use crate::odometry::Increment;
+use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
 use crate::pose::{components, is_finite, pose, rotate_covariance};
 use crate::registration::{RegistrationReport, Stamp, register, within_reach};
@@ -32,6 +33,7 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     counters: Counters,
     way_m: f32,
     closing: PendingClosure,
+    bias: Option<OdometryBias>,
     bearings: Vec<Vector2<f32>, BEAMS>,
     points: Vec<ScanPoint, BEAMS>,
     observed: Vec<Segment, MAX_SEGMENTS>,
@@ -131,6 +133,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             counters: Counters::default(),
             way_m: 0.0,
             closing: PendingClosure::default(),
+            bias: config.odometry.bias.map(OdometryBias::new),
             bearings: Vec::new(),
             points: Vec::new(),
             observed: Vec::new(),
@@ -159,6 +162,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// Covariance of the pose (x, y, θ), in `map`.
     pub fn covariance(&self) -> Matrix3<f32> {
         self.covariance
+    }
+
+    /// Systematic errors of the odometry as learnt so far: see [`OdometryBias::estimate`]. `None` where it does not learn.
+    pub fn odometry_bias(&self) -> Option<[f32; 3]> {
+        self.bias.as_ref().map(OdometryBias::estimate)
     }
 
     /// Counters since the start.
@@ -206,6 +214,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             if let Some(config) = self.config.loop_closure {
                 self.close_loop(&config, &mut update);
             }
+            self.learn_bias(&prior, motion, &update);
             self.extend_map(&mut update);
         }
         self.count(&update);
@@ -218,7 +227,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// Eq. (1) with covariance: where the odometry says the base is.
     fn predict(&mut self, motion: &ScanMotion) -> Prior {
-        let prior = self.prior_after(&motion.since_previous);
+        let prior = self.prior_after(&self.unbiased(&motion.since_previous));
         let covariance_is_finite = prior.covariance.iter().all(|v| v.is_finite());
         if !(motion.is_finite() && is_finite(&prior.pose) && covariance_is_finite) {
             self.counters.bad_motion = self.counters.bad_motion.saturating_add(1);
@@ -226,6 +235,21 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
         self.way_m += motion.since_previous.distance_m;
         prior
+    }
+
+    /// The increment without the systematic errors learnt so far.
+    fn unbiased(&self, increment: &Increment) -> Increment {
+        self.bias.as_ref().map_or(*increment, |bias| bias.corrected(increment))
+    }
+
+    /// Learns the odometry's systematic errors from a correction that left no direction open.
+    fn learn_bias(&mut self, prior: &Prior, motion: &ScanMotion, update: &SlamUpdate) {
+        let plain =
+            update.corrected && update.closure.is_none() && update.observability.verdict == Verdict::Full;
+        let Some(bias) = self.bias.as_mut().filter(|_| plain && motion.is_finite()) else { return };
+        let moved = crate::pose::log(&prior.pose.inv_mul(&update.pose));
+        let covariance = rotate_covariance(&prior.pose.inverse(), &prior.covariance);
+        bias.learn(&motion.since_previous, &moved, &covariance);
     }
 
     fn prior_after(&self, increment: &Increment) -> Prior {
