@@ -165,7 +165,7 @@ mod tests {
     fn pair(observed: &Segment, map: &[Segment], config: &AssociationConfig, sigma_m: f32) -> Option<usize> {
         let map: std::vec::Vec<MapSegment> = map
             .iter()
-            .map(|&segment| MapSegment { segment, hits: 3, last_seen: 0, seen_at_m: 0.0 })
+            .map(|&segment| MapSegment { segment, hits: 3, seen_through: 0, last_seen: 0, seen_at_m: 0.0 })
             .collect();
         let candidates: std::vec::Vec<u16> = (0..map.len() as u16).collect();
         let covariance =

@@ -12,6 +12,7 @@ use crate::odometry_bias::BiasConfig;
 use crate::registration::{RegistrationConfig, SumsConfig};
 use crate::residual::LineNoise;
 use crate::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
+use crate::visibility::ForgetConfig;
 
 /// Odometry settings.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -46,6 +47,8 @@ pub struct SlamConfig {
     pub correction: CorrectionConfig,
     /// Old parts of the map recognised, or not.
     pub loop_closure: Option<LoopConfig>,
+    /// What is seen through forgotten, or not.
+    pub forgetting: Option<ForgetConfig>,
     /// Segments to map.
     pub registration: RegistrationConfig,
 }
@@ -129,6 +132,7 @@ impl Default for SlamConfig {
                 same_position_m: 0.1,
                 same_heading_rad: 0.03,
             }),
+            forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.3, scans: 3 }),
             registration: RegistrationConfig::Sums(SumsConfig {
                 max_chi2: 9.2,
                 max_sigma_offset_m: 0.05,
@@ -163,6 +167,7 @@ impl SlamConfig {
             association: AssociationConfig::Bisector(BisectorConfig { max_distance_m: 0.3 }), // ours
             correction: CorrectionConfig::LeastSquares,
             loop_closure: None,
+            forgetting: None,
             registration: RegistrationConfig::EndPoints,
         }
     }
@@ -261,6 +266,12 @@ impl SlamConfig {
             not_negative("loop_closure.sigma_heading_rad_per_sqrt_m", c.sigma_heading_rad_per_sqrt_m)?;
             not_negative("loop_closure.min_support", c.min_support)?;
             not_negative("loop_closure.min_chi2", c.min_chi2)?;
+        }
+        if let Some(c) = &self.forgetting {
+            not_negative("forgetting.margin_m", c.margin_m)?;
+            not_negative("forgetting.margin_sigmas", c.margin_sigmas)?;
+            check("forgetting.min_sine", (0.0..=1.0).contains(&c.min_sine))?;
+            check("forgetting.scans", c.scans > 0)?;
         }
         if let RegistrationConfig::Sums(c) = &self.registration {
             positive("registration.sums.max_chi2", c.max_chi2)?;

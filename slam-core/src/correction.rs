@@ -331,7 +331,10 @@ mod tests {
     }
 
     fn entries(walls: &[Segment]) -> Vec<MapSegment> {
-        walls.iter().map(|&segment| MapSegment { segment, hits: 5, last_seen: 1, seen_at_m: 0.0 }).collect()
+        walls
+            .iter()
+            .map(|&segment| MapSegment { segment, hits: 5, seen_through: 0, last_seen: 1, seen_at_m: 0.0 })
+            .collect()
     }
 
     fn all_pairs(n: usize) -> Vec<Pair> {

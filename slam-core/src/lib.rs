@@ -82,6 +82,7 @@ pub mod residual;
 pub mod scan;
 pub mod segment;
 pub mod slam;
+pub mod visibility;
 
 pub use config::{ConfigError, SlamConfig};
 pub use map::{MapSegment, SegmentMap};

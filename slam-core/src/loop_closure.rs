@@ -119,7 +119,7 @@ mod tests {
     fn entry(x: f32, seen_at_m: f32) -> MapSegment {
         let segment =
             Segment::from_ends(Point2::new(x, 0.0), Point2::new(x, 1.0), 10, 1e-4, Point2::new(x - 1.0, 0.0));
-        MapSegment { segment, hits: 1, last_seen: 0, seen_at_m }
+        MapSegment { segment, hits: 1, seen_through: 0, last_seen: 0, seen_at_m }
     }
 
     #[test]

@@ -15,6 +15,8 @@ pub struct MapSegment {
     pub segment: Segment,
     /// Number of scans that saw it; stays at its maximum.
     pub hits: u16,
+    /// Scans whose beams went through it since it was last seen.
+    pub seen_through: u16,
     /// Number of the last scan that saw it.
     pub last_seen: u32,
     /// Way the robot had driven by then, metres.
@@ -41,6 +43,8 @@ pub struct MapCounters {
     pub refused: u32,
     /// Segments that became one with another.
     pub fused: u32,
+    /// Segments that beams went through until they were forgotten.
+    pub forgotten: u32,
 }
 
 impl<const N: usize> SegmentMap<N> {
@@ -52,7 +56,7 @@ impl<const N: usize> SegmentMap<N> {
     /// No segments.
     pub const fn new() -> Self {
         let () = Self::INDEX_FITS;
-        let counters = MapCounters { added: 0, evicted: 0, refused: 0, fused: 0 };
+        let counters = MapCounters { added: 0, evicted: 0, refused: 0, fused: 0, forgotten: 0 };
         Self { segments: Vec::new(), counters }
     }
 
@@ -77,7 +81,7 @@ impl<const N: usize> SegmentMap<N> {
 
     /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns whether it found a place. Work: `N` steps when full.
     pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> bool {
-        let entry = MapSegment { segment, hits: 1, last_seen: seen, seen_at_m };
+        let entry = MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m };
         if self.segments.push(entry).is_ok() {
             self.counters.added = self.counters.added.saturating_add(1);
             return true;
@@ -106,6 +110,14 @@ impl<const N: usize> SegmentMap<N> {
         kept.seen_at_m = kept.seen_at_m.max(taken.seen_at_m);
         self.segments.swap_remove(other);
         self.counters.fused = self.counters.fused.saturating_add(1);
+    }
+
+    /// Forgets the segments that do not stay.
+    pub(crate) fn retain(&mut self, stays: impl FnMut(&MapSegment) -> bool) {
+        let before = self.segments.len();
+        self.segments.retain(stays);
+        let gone = (before - self.segments.len()) as u32;
+        self.counters.forgotten = self.counters.forgotten.saturating_add(gone);
     }
 
     /// All segments, to be moved.

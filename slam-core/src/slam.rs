@@ -21,6 +21,7 @@ use crate::pose::{components, is_finite, pose, rotate_covariance};
 use crate::registration::{RegistrationReport, Stamp, register, within_reach};
 use crate::scan::Scan;
 use crate::segment::Segment;
+use crate::visibility::forget_seen_through;
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///
@@ -216,6 +217,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             }
             self.learn_bias(&prior, motion, &update);
             self.extend_map(&mut update);
+            self.forget(scan, &update);
         }
         self.count(&update);
         update.counters = self.counters;
@@ -435,6 +437,24 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let stamp = Stamp { scan: self.counters.scans, way_m: self.way_m };
         let (observed, pairs) = (&self.observed, &self.pairs);
         update.registration = register(observed, pairs, &view, &stamp, &config.registration, &mut self.map);
+    }
+
+    /// Forgets what the scan has seen through.
+    fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
+        let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
+        // Fusing may have moved segments: what is within reach is found anew.
+        let reach_m = f32::from(self.config.sensor.codes.max_mm) * 1e-3;
+        within_reach(self.map.segments(), &update.pose, reach_m, &mut self.candidates);
+        let (sensor, scan_number) = (&self.config.sensor, self.counters.scans);
+        forget_seen_through(
+            scan,
+            &update.pose,
+            scan_number,
+            sensor,
+            &config,
+            &self.candidates,
+            &mut self.map,
+        );
     }
 
     fn residual_m(&self, pose: &Isometry2<f32>) -> f32 {

@@ -1,0 +1,155 @@
+//! What is no longer there.
+//!
+//! In: map segments, the corrected pose, the scan. Out: map segments without those that beams went through. People walk on,
+//! doors are opened: their segments are seen through, again and again, and forgotten.
+//!
+//! Only a distance tells that a beam went through; a beam without echo may have met glass. A segment must be seen through
+//! along its whole length, from its free side, and more often than it was seen.
+
+use nalgebra::{Isometry2, Vector2};
+
+use crate::map::SegmentMap;
+use crate::math::{atan2, sqrt};
+use crate::scan::{Reading, Scan, SensorConfig};
+use crate::segment::Segment;
+
+/// Settings of forgetting.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct ForgetConfig {
+    /// A beam went through a segment when it ended farther behind it than this, metres, …
+    pub margin_m: f32,
+    /// … and than this many standard deviations of its range.
+    pub margin_sigmas: f32,
+    /// Segments seen at a flatter angle are not judged, as the sine of the angle.
+    pub min_sine: f32,
+    /// A segment is forgotten when this many scans, and as many as saw it, have seen through it since it was last seen.
+    pub scans: u16,
+}
+
+/// Parts of a segment at which beams are looked up.
+const SAMPLES: [f32; 3] = [0.2, 0.5, 0.8];
+
+/// Forgets the candidates that this scan and those before have seen through. Work: three look-ups for each candidate.
+pub fn forget_seen_through<const N: usize>(
+    scan: &Scan<'_>,
+    pose: &Isometry2<f32>,
+    scan_number: u32,
+    sensor: &SensorConfig,
+    config: &ForgetConfig,
+    candidates: &[u16],
+    map: &mut SegmentMap<N>,
+) {
+    let laser_from_map = (pose * sensor.mounting.base_from_laser).inverse();
+    for &candidate in candidates {
+        let Some(entry) = map.get_mut(usize::from(candidate)) else { continue };
+        if entry.last_seen == scan_number {
+            entry.seen_through = 0;
+        } else if seen_through(&entry.segment, scan, &laser_from_map, sensor, config) {
+            entry.seen_through = entry.seen_through.saturating_add(1);
+        }
+    }
+    map.retain(|entry| entry.seen_through < config.scans || entry.seen_through < entry.hits);
+}
+
+/// Whether the beams towards a segment all ended behind it.
+fn seen_through(
+    segment: &Segment,
+    scan: &Scan<'_>,
+    laser_from_map: &Isometry2<f32>,
+    sensor: &SensorConfig,
+    config: &ForgetConfig,
+) -> bool {
+    let normal = laser_from_map.rotation * segment.normal();
+    SAMPLES.iter().all(|&share| {
+        let point = laser_from_map * (segment.start + (segment.end - segment.start) * share);
+        let distance = sqrt(point.coords.norm_squared());
+        // The free side faces the sensor, and not too flatly.
+        if normal.dot(&point.coords) > -config.min_sine * distance {
+            return false;
+        }
+        let Some(range_m) = range_towards(&point.coords, scan, sensor) else { return false };
+        let margin_m = config.margin_m + config.margin_sigmas * sqrt(sensor.noise.variance(range_m));
+        range_m > distance + margin_m
+    })
+}
+
+/// Range that the beam towards a point of `laser` measured, if it measured one.
+fn range_towards(point: &Vector2<f32>, scan: &Scan<'_>, sensor: &SensorConfig) -> Option<f32> {
+    let side = if sensor.mounting.upside_down { -1.0 } else { 1.0 };
+    let geometry = &sensor.geometry;
+    let turn = geometry.steps_per_revolution;
+    let steps = side * atan2(point.y, point.x) / geometry.step_rad() + f32::from(geometry.front_step) + 0.5;
+    // The bearing is known up to a whole turn: the one at or after the first step is taken.
+    let first = f32::from(geometry.first_step);
+    let steps = if steps < first { steps + turn } else { steps };
+    let beam = (steps - first) as usize;
+    let step = geometry.first_step.saturating_add(beam as u16);
+    let (used_from, used_to) = sensor.used_steps;
+    let value_mm = scan.ranges_mm.get(beam).filter(|_| (used_from..=used_to).contains(&step))?;
+    match sensor.codes.read(*value_mm) {
+        Reading::Range(range_m) => Some(range_m),
+        Reading::NoEcho | Reading::Bad => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::SlamConfig;
+    use nalgebra::Point2;
+
+    const CONFIG: ForgetConfig = ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.3, scans: 3 };
+
+    /// A segment across the robot's view, 2 m ahead of the axle, its free side towards it or away from it.
+    fn segment(facing: bool) -> Segment {
+        let viewpoint = Point2::new(if facing { 0.0 } else { 4.0 }, 0.0);
+        Segment::from_ends(Point2::new(2.0, -0.2), Point2::new(2.0, 0.2), 10, 1e-4, viewpoint)
+    }
+
+    fn left_after(scans: u32, hits: u16, range_mm: u16, facing: bool) -> usize {
+        let sensor = SlamConfig::paper().sensor;
+        let mut map = SegmentMap::<4>::new();
+        map.insert(segment(facing), 0, 0.0);
+        map.get_mut(0).unwrap().hits = hits;
+        for scan_number in 1..=scans {
+            let ranges = [range_mm; 682];
+            let scan = Scan { ranges_mm: &ranges };
+            forget_seen_through(&scan, &Isometry2::identity(), scan_number, &sensor, &CONFIG, &[0], &mut map);
+        }
+        map.segments().len()
+    }
+
+    #[test]
+    fn what_beams_go_through_is_forgotten() {
+        assert_eq!(left_after(2, 1, 3000, true), 1, "not at once");
+        assert_eq!(left_after(3, 1, 3000, true), 0);
+        assert_eq!(left_after(5, 6, 3000, true), 1, "what was seen more often stays longer");
+        assert_eq!(left_after(6, 6, 3000, true), 0);
+    }
+
+    #[test]
+    fn what_is_hidden_faces_away_or_gives_no_echo_stays() {
+        assert_eq!(left_after(9, 1, 1000, true), 1, "hidden");
+        assert_eq!(left_after(9, 1, 1870, true), 1, "still there");
+        assert_eq!(left_after(9, 1, 0, true), 1, "no echo");
+        assert_eq!(left_after(9, 1, 3000, false), 1, "its other face");
+    }
+
+    #[test]
+    fn beams_behind_the_robot_and_out_of_use_are_none() {
+        let sensor = SlamConfig::paper().sensor;
+        let ranges = [1234u16; 682];
+        let scan = Scan { ranges_mm: &ranges };
+        assert!(range_towards(&Vector2::new(1.0, 0.0), &scan, &sensor).is_some());
+        assert!(range_towards(&Vector2::new(-1.0, 0.0), &scan, &sensor).is_none());
+        for (beam, bearing) in [(0usize, -119.53f32), (340, 0.0), (681, 119.88)] {
+            let mut ranges = [0u16; 682];
+            ranges[beam] = 1000;
+            let (s, c) = bearing.to_radians().sin_cos();
+            let scan = Scan { ranges_mm: &ranges };
+            assert!(range_towards(&Vector2::new(c, s), &scan, &sensor).is_some(), "{beam}");
+        }
+    }
+}
