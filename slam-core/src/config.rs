@@ -87,7 +87,7 @@ impl Default for SlamConfig {
                 integration: Integration::Arc,
                 noise: ODOMETRY_NOISE,
                 bias: Some(BiasConfig {
-                    sigma_distance: 0.015,
+                    sigma_distance: 0.01,
                     sigma_turn: 0.01,
                     sigma_turn_per_m: 0.005,
                     most_sigmas: 3.0,
@@ -132,7 +132,7 @@ impl Default for SlamConfig {
                 same_position_m: 0.1,
                 same_heading_rad: 0.03,
             }),
-            forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.3, scans: 3 }),
+            forgetting: Some(ForgetConfig { margin_m: 0.3, margin_sigmas: 3.0, min_sine: 0.3, scans: 5 }),
             registration: RegistrationConfig::Sums(SumsConfig {
                 max_chi2: 9.2,
                 max_sigma_offset_m: 0.05,

@@ -7,9 +7,9 @@
 //! ```text
 //!  ranges_mm ──► deskew ──► extraction ──► association ◄──┐ ──► registration ──► map
 //!                  ▲        [Segment]       [Pair] │      │          ▲            │
-//!  ticks ──► odometry ──► predicted pose ──────────▼──► correction ──┤            │
-//!            [OdometryTrack]                 heading search          │            │
-//!                                                  loop closure ─────┘ ◄──────────┘
+//!  ticks ──► odometry ──► predicted pose ──────────▼──► correction ──┤      forgetting
+//!            [OdometryTrack]  ▲              heading search │        │            │
+//!                             └───── odometry bias ◄────────┘ loop closure ◄──────┘
 //! ```
 //!
 //! [`Slam::process_scan`](slam::Slam::process_scan) is that drawing; each stage is a module of its own and can be used
