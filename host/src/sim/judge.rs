@@ -149,7 +149,7 @@ fn line_for(corner: Point2<f64>, wall: &Vector2<f64>, map: &[MapSegment]) -> Opt
     let fits = |entry: &&MapSegment| {
         let segment = &entry.segment;
         let direction: Vector2<f64> = nalgebra::convert(segment.direction);
-        let ends: [Point2<f64>; 2] = [segment.start, segment.end].map(|p| nalgebra::convert(p));
+        let ends: [Point2<f64>; 2] = [segment.start, segment.end].map(nalgebra::convert);
         let ways = ends.map(|end| (end - corner).dot(wall));
         let off = (ends[0] - corner).perp(&direction).abs();
         direction.perp(wall).abs() < WALL_SINE
