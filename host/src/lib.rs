@@ -8,3 +8,4 @@ pub mod replay;
 pub mod robot;
 pub mod score;
 pub mod sim;
+pub mod toml_file;

@@ -14,9 +14,10 @@ use lineslam::output::report::{Report, SimulationReport};
 use lineslam::output::svg::Caption;
 use lineslam::output::{self, csv, grid, svg, tum};
 use lineslam::replay::{self, Replay, ReplayError};
-use lineslam::robot::{Robot, RobotError};
-use lineslam::sim::world::{Edge, World, WorldError};
+use lineslam::robot::Robot;
+use lineslam::sim::world::{Edge, World};
 use lineslam::sim::{self, BadSetting, SimConfig, judge};
+use lineslam::toml_file::FileError;
 use slam_core::SlamConfig;
 
 /// Line-segment SLAM, the same core as on the microcontroller.
@@ -111,9 +112,8 @@ fn main() -> ExitCode {
         Err(error) => {
             eprintln!("error: {error:#}");
             let bad_input = error.is::<log::LogError>()
-                || error.is::<RobotError>()
+                || error.is::<FileError>()
                 || error.is::<ReplayError>()
-                || error.is::<WorldError>()
                 || error.is::<BadSetting>();
             ExitCode::from(if bad_input { 2 } else { 1 })
         }

@@ -2,7 +2,7 @@
 //!
 //! Every key is needed and no other is known, so that a slip of the pen is an error that names it, with the file.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::Deserialize;
 use slam_core::SlamConfig;
@@ -10,36 +10,7 @@ use slam_core::odometry::{DifferentialDrive, OdometryNoise};
 use slam_core::pose::pose;
 use slam_core::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry};
 
-/// Why a robot file could not be used.
-#[derive(Debug, thiserror::Error)]
-pub enum RobotError {
-    /// The file could not be read.
-    #[error("{}: {source}", path.display())]
-    Read {
-        /// The robot file.
-        path: PathBuf,
-        /// What the system said.
-        source: std::io::Error,
-    },
-    /// Not TOML, an unknown key, a missing key or a wrong type; the message names key and line.
-    #[error("{}: {source}", path.display())]
-    Parse {
-        /// The robot file.
-        path: PathBuf,
-        /// What the parser said.
-        source: Box<toml::de::Error>,
-    },
-    /// A value that no robot has.
-    #[error("{}: {key}: {reason}", path.display())]
-    Impossible {
-        /// The robot file.
-        path: PathBuf,
-        /// Key with its table, as `sensor.steps.last`.
-        key: &'static str,
-        /// What is wrong with it.
-        reason: String,
-    },
-}
+use crate::toml_file::{self, Checked, FileError, Impossible, finite, not_negative, positive};
 
 /// A robot, as its file describes it.
 #[derive(Clone, Debug, Deserialize)]
@@ -147,44 +118,18 @@ pub struct StatedGeometry {
     pub base_from_laser: [f32; 3],
 }
 
-impl Robot {
-    /// Reads and checks a robot file.
-    pub fn load(path: &Path) -> Result<Self, RobotError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| RobotError::Read { path: path.to_owned(), source })?;
-        Self::parse(&text, path)
-    }
-
-    /// The robot that a format's logs were recorded with, built in: `robots/mines.toml`, `robots/sick.toml`, or
-    /// `robots/paper.toml` for simulated ones.
-    pub fn usual_for(format: &str) -> Self {
-        let (text, name) = match format {
-            "mines" => (include_str!("../../robots/mines.toml"), "robots/mines.toml"),
-            "simulated" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
-            _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
-        };
-        Self::parse(text, Path::new(name)).expect("the built-in robots are tested")
-    }
-
-    fn parse(text: &str, path: &Path) -> Result<Self, RobotError> {
-        let robot: Self = toml::from_str(text)
-            .map_err(|source| RobotError::Parse { path: path.to_owned(), source: Box::new(source) })?;
-        robot.check().map_err(|(key, reason)| RobotError::Impossible {
-            path: path.to_owned(),
-            key,
-            reason,
-        })?;
-        Ok(robot)
-    }
-
-    fn check(&self) -> Result<(), (&'static str, String)> {
+impl Checked for Robot {
+    fn check(&self) -> Result<(), Impossible> {
         if let Some(w) = &self.wheels {
             positive("wheels.left_radius_m", w.left_radius_m)?;
             positive("wheels.right_radius_m", w.right_radius_m)?;
             positive("wheels.track_m", w.track_m)?;
             positive("wheels.ticks_per_turn", w.ticks_per_turn)?;
             if w.counter_bits != 16 && w.counter_bits != 32 {
-                return Err(("wheels.counter_bits", format!("{} is neither 16 nor 32", w.counter_bits)));
+                return Err((
+                    "wheels.counter_bits".into(),
+                    format!("{} is neither 16 nor 32", w.counter_bits),
+                ));
             }
         }
         let n = &self.odometry_noise;
@@ -200,39 +145,58 @@ impl Robot {
         finite("mounting.y_m", m.y_m)?;
         finite("mounting.yaw_deg", m.yaw_deg)
     }
+}
 
-    fn check_sensor(&self) -> Result<(), (&'static str, String)> {
+impl Robot {
+    /// Reads and checks a robot file.
+    pub fn load(path: &Path) -> Result<Self, FileError> {
+        toml_file::load(path)
+    }
+
+    /// The robot that a format's logs were recorded with, built in: `robots/mines.toml`, `robots/sick.toml`, or
+    /// `robots/paper.toml` for simulated ones.
+    pub fn usual_for(format: &str) -> Self {
+        let (text, name) = match format {
+            "mines" => (include_str!("../../robots/mines.toml"), "robots/mines.toml"),
+            "simulated" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
+            _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
+        };
+        toml_file::parse(text, Path::new(name)).expect("the built-in robots are tested")
+    }
+
+    fn check_sensor(&self) -> Result<(), Impossible> {
         let s = &self.sensor;
         if s.max_range_mm <= s.min_range_mm {
             let reason = format!("{} is not above min_range_mm = {}", s.max_range_mm, s.min_range_mm);
-            return Err(("sensor.max_range_mm", reason));
+            return Err(("sensor.max_range_mm".into(), reason));
         }
         if s.max_range_mm > u32::from(u16::MAX) {
-            return Err(("sensor.max_range_mm", format!("{} is above 65535", s.max_range_mm)));
+            return Err(("sensor.max_range_mm".into(), format!("{} is above 65535", s.max_range_mm)));
         }
         if s.no_echo_mm.len() > 2 {
             return Err((
-                "sensor.no_echo_mm",
+                "sensor.no_echo_mm".into(),
                 format!("{} intervals, at most 2 are possible", s.no_echo_mm.len()),
             ));
         }
         if let Some([from, to]) = s.no_echo_mm.iter().find(|[from, to]| from > to) {
-            return Err(("sensor.no_echo_mm", format!("interval [{from}, {to}] is empty")));
+            return Err(("sensor.no_echo_mm".into(), format!("interval [{from}, {to}] is empty")));
         }
         positive("sensor.sigma_m", s.sigma_m)?;
         not_negative("sensor.sigma_per_m", s.sigma_per_m)?;
         positive("sensor.sigma_bearing_deg", s.sigma_bearing_deg)?;
         positive("sensor.line_sigma_m", s.line_sigma_m)?;
         if !(-10.0..=10.0).contains(&s.scan_delay_s) {
-            return Err(("sensor.scan_delay_s", format!("{} is not within ±10 s", s.scan_delay_s)));
+            return Err(("sensor.scan_delay_s".into(), format!("{} is not within ±10 s", s.scan_delay_s)));
         }
         match (&s.steps, &s.field) {
             (Some(steps), None) => steps.check(),
             (None, Some(field)) if field.of_view_deg > 0.0 && field.of_view_deg <= 360.0 => Ok(()),
-            (None, Some(field)) => {
-                Err(("sensor.field.of_view_deg", format!("{} is not within 0 to 360", field.of_view_deg)))
-            }
-            _ => Err(("sensor", "needs either [sensor.steps] or [sensor.field]".into())),
+            (None, Some(field)) => Err((
+                "sensor.field.of_view_deg".into(),
+                format!("{} is not within 0 to 360", field.of_view_deg),
+            )),
+            _ => Err(("sensor".into(), "needs either [sensor.steps] or [sensor.field]".into())),
         }
     }
 
@@ -320,39 +284,30 @@ impl Steps {
         }
     }
 
-    fn check(&self) -> Result<(), (&'static str, String)> {
+    fn check(&self) -> Result<(), Impossible> {
         positive("sensor.steps.per_revolution", self.per_revolution)?;
         if self.last <= self.first {
-            return Err(("sensor.steps.last", format!("{} is not above first = {}", self.last, self.first)));
+            return Err((
+                "sensor.steps.last".into(),
+                format!("{} is not above first = {}", self.last, self.first),
+            ));
         }
         if f32::from(self.last - self.first) > self.per_revolution {
-            return Err(("sensor.steps.last", "the steps are more than a revolution".into()));
+            return Err(("sensor.steps.last".into(), "the steps are more than a revolution".into()));
         }
         if !(0.0..=10.0).contains(&self.revolution_s) {
             return Err((
-                "sensor.steps.revolution_s",
+                "sensor.steps.revolution_s".into(),
                 format!("{} is not within 0 to 10 s", self.revolution_s),
             ));
         }
         let [from, to] = self.used;
         if from > to || from < self.first || to > self.last {
             return Err((
-                "sensor.steps.used",
+                "sensor.steps.used".into(),
                 format!("[{from}, {to}] is not within the steps of the sensor"),
             ));
         }
         Ok(())
     }
-}
-
-fn finite(key: &'static str, value: f32) -> Result<(), (&'static str, String)> {
-    if value.is_finite() { Ok(()) } else { Err((key, format!("{value} is not finite"))) }
-}
-
-fn positive(key: &'static str, value: f32) -> Result<(), (&'static str, String)> {
-    if value > 0.0 && value.is_finite() { Ok(()) } else { Err((key, format!("{value} is not above zero"))) }
-}
-
-fn not_negative(key: &'static str, value: f32) -> Result<(), (&'static str, String)> {
-    if value >= 0.0 && value.is_finite() { Ok(()) } else { Err((key, format!("{value} is below zero"))) }
 }

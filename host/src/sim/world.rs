@@ -1,40 +1,11 @@
 //! Worlds: a building, what stands and walks in it, and the path a robot takes, in TOML.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::{Point2, Vector2};
 use serde::Deserialize;
 
-/// Why a world could not be used.
-#[derive(Debug, thiserror::Error)]
-pub enum WorldError {
-    /// The file could not be read.
-    #[error("{}: {source}", path.display())]
-    Read {
-        /// The world file.
-        path: PathBuf,
-        /// What the system said.
-        source: std::io::Error,
-    },
-    /// Not TOML, an unknown key, a missing key or a wrong type.
-    #[error("{}: {source}", path.display())]
-    Parse {
-        /// The world file.
-        path: PathBuf,
-        /// What the parser said.
-        source: Box<toml::de::Error>,
-    },
-    /// A value that no building has.
-    #[error("{}: {key}: {reason}", path.display())]
-    Impossible {
-        /// The world file.
-        path: PathBuf,
-        /// Key, with its number from 1 in a list.
-        key: String,
-        /// What is wrong with it.
-        reason: String,
-    },
-}
+use crate::toml_file::{self, Checked, FileError, Impossible, positive};
 
 /// A world, as its file describes it. Metres and degrees, in the frame of the blueprint.
 #[derive(Clone, Debug, Deserialize)]
@@ -173,29 +144,8 @@ pub struct Disc {
     pub radius: f64,
 }
 
-impl World {
-    /// Reads and checks a world file.
-    pub fn load(path: &Path) -> Result<Self, WorldError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| WorldError::Read { path: path.to_owned(), source })?;
-        let world: Self = toml::from_str(&text)
-            .map_err(|source| WorldError::Parse { path: path.to_owned(), source: Box::new(source) })?;
-        world.check().map_err(|(key, reason)| WorldError::Impossible {
-            path: path.to_owned(),
-            key,
-            reason,
-        })?;
-        Ok(world)
-    }
-
-    fn check(&self) -> Result<(), (String, String)> {
-        let positive = |key: String, value: f64| {
-            if value > 0.0 && value.is_finite() {
-                Ok(())
-            } else {
-                Err((key, format!("{value} is not above zero")))
-            }
-        };
+impl Checked for World {
+    fn check(&self) -> Result<(), Impossible> {
         let finite = |key: &str, points: &[[f64; 2]]| match points.iter().flatten().find(|v| !v.is_finite()) {
             Some(v) => Err((key.to_owned(), format!("{v} is not finite"))),
             None => Ok(()),
@@ -228,7 +178,7 @@ impl World {
             }
         }
         finite("path.points", &self.path.points)?;
-        positive("path.speed".into(), self.path.speed)?;
+        positive("path.speed", self.path.speed)?;
         if self.path.points.len() < 2 {
             return Err(("path.points".into(), "has fewer than two way points".into()));
         }
@@ -239,6 +189,13 @@ impl World {
             }
         }
         Ok(())
+    }
+}
+
+impl World {
+    /// Reads and checks a world file.
+    pub fn load(path: &Path) -> Result<Self, FileError> {
+        toml_file::load(path)
     }
 
     /// Every straight surface.
