@@ -171,7 +171,7 @@ fn results(
     blueprint: &[Edge],
 ) -> anyhow::Result<Vec<(&'static str, Vec<u8>)>> {
     let caption = Caption { log: name, configuration: &report.configuration };
-    let grid = grid::render(&result.steps).context("map.pgm")?;
+    let grid = grid::render(result).context("map.pgm")?;
     Ok(vec![
         ("trajectory.tum", tum::render(replay::trajectory(&result.steps)).into_bytes()),
         ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),

@@ -8,7 +8,7 @@ use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::{Increment, ticks_between_u16, ticks_between_u32};
 use slam_core::pose::pose;
 use slam_core::slam::Counters;
-use slam_core::{OdometryTrack, Scan, Segment, Slam, SlamConfig, SlamUpdate};
+use slam_core::{OdometryTrack, Scan, Slam, SlamConfig, SlamUpdate};
 
 use crate::log::{Log, Odometry};
 use crate::robot::Robot;
@@ -62,10 +62,6 @@ pub struct Step {
     pub took: Duration,
     /// Points of the scan in `base`.
     pub points: Vec<Point2<f32>>,
-    /// Segments seen, in `base` at the middle beam.
-    pub observed: Vec<Segment>,
-    /// Pose of the scanner in `base`.
-    pub sensor: Isometry2<f32>,
 }
 
 /// A replayed log.
@@ -150,8 +146,6 @@ fn run_sized<const BEAMS: usize>(
             update,
             took,
             points: slam.points().iter().map(|p| p.position).collect(),
-            observed: slam.observed().to_vec(),
-            sensor: config.sensor.mounting.base_from_laser,
         });
         progress();
     }

@@ -80,6 +80,9 @@ const ODOMETRY_NOISE: OdometryNoise = OdometryNoise {
 
 impl Default for SlamConfig {
     /// The best we know.
+    ///
+    /// Sensor geometry and codes are the data sheet's. All other values are ours: chosen by the geometric mean of the
+    /// trajectory error over eight or more seeds of range noise on recorded logs of two kinds of scanner.
     fn default() -> Self {
         Self {
             sensor: PAPER_SENSOR,
@@ -266,6 +269,9 @@ impl SlamConfig {
             not_negative("loop_closure.sigma_heading_rad_per_sqrt_m", c.sigma_heading_rad_per_sqrt_m)?;
             not_negative("loop_closure.min_support", c.min_support)?;
             not_negative("loop_closure.min_chi2", c.min_chi2)?;
+            check("loop_closure.confirmations", c.confirmations > 0)?;
+            not_negative("loop_closure.same_position_m", c.same_position_m)?;
+            not_negative("loop_closure.same_heading_rad", c.same_heading_rad)?;
         }
         if let Some(c) = &self.forgetting {
             not_negative("forgetting.margin_m", c.margin_m)?;

@@ -70,11 +70,6 @@ impl<const N: usize> SegmentMap<N> {
         self.counters
     }
 
-    /// Forgets everything, counters included.
-    pub fn clear(&mut self) {
-        *self = Self::new();
-    }
-
     pub(crate) fn get_mut(&mut self, index: usize) -> Option<&mut MapSegment> {
         self.segments.get_mut(index)
     }

@@ -146,10 +146,9 @@ mod tests {
         let mut reference = nalgebra::Matrix3::<f64>::zeros();
         for i in 0..25 {
             let p = Point2::new(2.0, -1.0 + 2.0 * f64::from(i) / 24.0);
-            let (rx, ry) = (p.x - f64::from(position.x), p.y - f64::from(position.y));
+            let ry = p.y - f64::from(position.y);
             // Normal (-1, 0): derivative of -(x component) by the pose.
             let j = nalgebra::RowVector3::new(-1.0, 0.0, ry);
-            let _ = rx;
             reference += j.transpose() * j * 1.0e4;
         }
         for (got, want) in information.iter().zip(reference.iter()) {

@@ -151,11 +151,6 @@ impl Line {
     pub fn signed_distance(&self, point: Point2<f32>) -> f32 {
         self.normal.dot(&point.coords) - self.distance_m
     }
-
-    /// Foot of the perpendicular from a point.
-    pub fn foot(&self, point: Point2<f32>) -> Point2<f32> {
-        point - self.normal * self.signed_distance(point)
-    }
 }
 
 /// A directed line segment with the sums of the points it stands for.

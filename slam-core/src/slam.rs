@@ -284,16 +284,21 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// From the prediction to the corrected pose.
     fn correct(&mut self, prior: &Prior, motion: &ScanMotion, update: &mut SlamUpdate) {
-        let reach_m = match self.config.association {
-            AssociationConfig::Bisector(_) => f32::INFINITY,
-            AssociationConfig::Gated(_) => f32::from(self.config.sensor.codes.max_mm) * 1e-3,
-        };
-        within_reach(self.map.segments(), &prior.pose, reach_m, &mut self.candidates);
+        self.find_candidates(&prior.pose);
         let predicted = *update;
         self.refine(prior, update);
         if let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction {
             self.search_heading(prior, motion, &config.search, &predicted, update);
         }
+    }
+
+    /// The map segments that a scan from this pose can touch; the paper looks at all of them.
+    fn find_candidates(&mut self, pose: &Isometry2<f32>) {
+        let reach_m = match self.config.association {
+            AssociationConfig::Bisector(_) => f32::INFINITY,
+            AssociationConfig::Gated(_) => f32::from(self.config.sensor.codes.max_mm) * 1e-3,
+        };
+        within_reach(self.map.segments(), pose, reach_m, &mut self.candidates);
     }
 
     /// Rounds of association and correction from the pose of `update`.
@@ -443,8 +448,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
         let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
         // Fusing may have moved segments: what is within reach is found anew.
-        let reach_m = f32::from(self.config.sensor.codes.max_mm) * 1e-3;
-        within_reach(self.map.segments(), &update.pose, reach_m, &mut self.candidates);
+        self.find_candidates(&update.pose);
         let (sensor, scan_number) = (&self.config.sensor, self.counters.scans);
         forget_seen_through(
             scan,

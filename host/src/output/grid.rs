@@ -7,7 +7,8 @@ use image::codecs::pnm::{PnmEncoder, PnmSubtype, SampleEncoding};
 use image::{GrayImage, ImageError, Luma};
 use nalgebra::Point2;
 
-use crate::replay::Step;
+use super::bounds;
+use crate::replay::{Replay, Step};
 
 /// Edge of a cell, metres.
 const CELL_M: f32 = 0.05;
@@ -31,10 +32,10 @@ pub struct Grid {
 }
 
 /// Draws the grid of all scans.
-pub fn render(steps: &[Step]) -> Result<Grid, ImageError> {
-    let mut canvas = Canvas::around(steps);
-    for step in steps {
-        let sensor = step.pose_in_final_map * Point2::from(step.sensor.translation.vector);
+pub fn render(replay: &Replay) -> Result<Grid, ImageError> {
+    let mut canvas = Canvas::around(replay);
+    for step in &replay.steps {
+        let sensor = sensor_at(replay, step);
         for point in &step.points {
             canvas.cast(sensor, step.pose_in_final_map * point);
         }
@@ -50,6 +51,12 @@ pub fn render(steps: &[Step]) -> Result<Grid, ImageError> {
     Ok(Grid { pgm, yaml })
 }
 
+/// Where the scanner was in the final map.
+fn sensor_at(replay: &Replay, step: &Step) -> Point2<f32> {
+    let base_from_laser = &replay.config.sensor.mounting.base_from_laser;
+    step.pose_in_final_map * Point2::from(base_from_laser.translation.vector)
+}
+
 struct Canvas {
     origin: Point2<f32>,
     cell_m: f32,
@@ -60,19 +67,13 @@ struct Canvas {
 }
 
 impl Canvas {
-    fn around(steps: &[Step]) -> Self {
-        let (mut low, mut high) = (Point2::new(f32::MAX, f32::MAX), Point2::new(f32::MIN, f32::MIN));
-        for step in steps {
-            let sensor = step.pose_in_final_map * Point2::from(step.sensor.translation.vector);
-            let hits = step
-                .points
-                .iter()
-                .map(|p| step.pose_in_final_map * p)
-                .filter(|p| (p - sensor).norm() <= REACH_M);
-            for p in hits.chain([sensor]) {
-                (low, high) = (low.inf(&p), high.sup(&p));
-            }
-        }
+    fn around(replay: &Replay) -> Self {
+        let touched = replay.steps.iter().flat_map(|step| {
+            let sensor = sensor_at(replay, step);
+            let points = step.points.iter().map(|p| step.pose_in_final_map * p);
+            points.filter(move |p| (p - sensor).norm() <= REACH_M).chain([sensor])
+        });
+        let (low, high) = bounds(touched);
         let extent = (high - low).max() + 2.0 * CELL_M;
         let cell_m = CELL_M.max(extent / MOST_CELLS);
         let origin = Point2::new((low.x / cell_m).floor() - 1.0, (low.y / cell_m).floor() - 1.0) * cell_m;

@@ -10,6 +10,16 @@ pub mod tum;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use nalgebra::Point2;
+
+/// Lower left and upper right corner of the box around points; the origin twice without any.
+fn bounds(points: impl Iterator<Item = Point2<f32>>) -> (Point2<f32>, Point2<f32>) {
+    let grown = points.fold(None, |grown: Option<(Point2<f32>, Point2<f32>)>, p| {
+        Some(grown.map_or((p, p), |(low, high)| (low.inf(&p), high.sup(&p))))
+    });
+    grown.unwrap_or((Point2::origin(), Point2::origin()))
+}
+
 /// The files could not be written; none was.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {source}", path.display())]

@@ -11,6 +11,7 @@ use slam_core::MapSegment;
 use svg::Document;
 use svg::node::element::{Circle, Group, Line, Path, Rectangle, Text};
 
+use super::bounds;
 use crate::replay::Replay;
 use crate::sim::world::Edge;
 
@@ -65,13 +66,7 @@ impl View {
         );
         points.extend(blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
         points.extend(replay.steps.iter().map(|s| Point2::from(s.pose_in_final_map.translation.vector)));
-        let (mut low, mut high) = (Point2::new(f32::MAX, f32::MAX), Point2::new(f32::MIN, f32::MIN));
-        for p in &points {
-            (low, high) = (low.inf(p), high.sup(p));
-        }
-        if points.is_empty() {
-            (low, high) = (Point2::origin(), Point2::origin());
-        }
+        let (low, high) = bounds(points.into_iter());
         // At least two metres, so that a robot that stands still has a picture too.
         let centre = nalgebra::center(&low, &high);
         let half = ((high - low) * 0.5).sup(&Vector2::new(1.0, 1.0)) + Vector2::new(0.4, 0.4);

@@ -20,6 +20,10 @@ use crate::segment::{Moments, Segment};
 /// Pieces waiting to be looked at. Each split adds one; deeper clusters give up their smallest detail.
 const STACK: usize = 32;
 
+/// Points nearer than this share of the sensor's range are surely within it.
+const FAR_SHARE: f32 = 0.8;
+/// Readings this many standard deviations within the sensor's range are not lost.
+const LOST_SIGMAS: f32 = 4.0;
 /// A line goes on behind this many points off it.
 const MOST_STRAYS: usize = 2;
 
@@ -90,12 +94,6 @@ fn joined(
         && (b.position - a.position).norm_squared() <= limit_m * limit_m
 }
 
-/// A straight run of points and its sums.
-struct Piece<'a> {
-    points: &'a [ScanPoint],
-    moments: Moments,
-}
-
 fn split_cluster(cluster: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConfig, out: &mut Collector<'_>) {
     if (cluster.len() as u32) < config.min_inliers {
         return;
@@ -139,7 +137,7 @@ fn close(
     if let Some((from, to, moments)) = open
         && let Some(points) = cluster.get(from..to)
     {
-        finish(Piece { points, moments }, view, config, out);
+        finish(points, &moments, view, config, out);
     }
 }
 
@@ -211,31 +209,37 @@ fn refined(points: &[ScanPoint], line: &Moments, view: &Viewpoint<'_>, config: &
 /// remains there is too near on average.
 fn beyond_sight(point: &ScanPoint, normal: Vector2<f32>, line: &Moments, view: &Viewpoint<'_>) -> bool {
     let max_m = f32::from(view.sensor.codes.max_mm) * 1e-3;
-    if point.range_m < 0.8 * max_m {
+    if point.range_m < FAR_SHARE * max_m {
         return false;
     }
     let along_beam = normal.dot(&(point.position - view.position));
     let to_line = normal.dot(&(line.centroid - view.position));
     let line_range_m = point.range_m * to_line / along_beam;
-    let limit_m = max_m - 4.0 * sqrt(view.sensor.noise.variance(max_m));
+    let limit_m = max_m - LOST_SIGMAS * sqrt(view.sensor.noise.variance(max_m));
     line_range_m > limit_m
 }
 
 /// Trims the ends, tests and keeps a piece.
-fn finish(piece: Piece<'_>, view: &Viewpoint<'_>, config: &SplitConfig, out: &mut Collector<'_>) {
-    if piece.moments.inliers < config.min_inliers {
+fn finish(
+    points: &[ScanPoint],
+    fit: &Moments,
+    view: &Viewpoint<'_>,
+    config: &SplitConfig,
+    out: &mut Collector<'_>,
+) {
+    if fit.inliers < config.min_inliers {
         return;
     }
-    let normal = perpendicular(piece.moments.direction());
+    let normal = perpendicular(fit.direction());
     let off_line = |point: &ScanPoint| {
-        let off = normal.dot(&(point.position - piece.moments.centroid));
+        let off = normal.dot(&(point.position - fit.centroid));
         let limit = config.trim_sigmas * config.trim_sigmas * variance_across(point, normal, view);
-        off * off > limit || beyond_sight(point, normal, &piece.moments, view)
+        off * off > limit || beyond_sight(point, normal, fit, view)
     };
-    let leading = piece.points.iter().take_while(|p| off_line(p)).count();
-    let trailing = piece.points.iter().rev().take_while(|p| off_line(p)).count();
-    let Some(kept) = piece.points.get(leading..piece.points.len().saturating_sub(trailing)) else { return };
-    let moments = refined(kept, &piece.moments, view, config);
+    let leading = points.iter().take_while(|p| off_line(p)).count();
+    let trailing = points.iter().rev().take_while(|p| off_line(p)).count();
+    let Some(kept) = points.get(leading..points.len().saturating_sub(trailing)) else { return };
+    let moments = refined(kept, fit, view, config);
     let moments = refined(kept, &moments, view, config);
     let (Some(first), Some(last)) = (kept.first(), kept.last()) else { return };
     let ends: [Point2<f32>; 2] = [first.position, last.position];
