@@ -9,13 +9,14 @@ use anyhow::Context;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comfy_table::{CellAlignment, Table, presets};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use lineslam::experiments::{self, ExperimentError, document};
 use lineslam::log::{self, Format, Log, ReadOptions};
 use lineslam::output::report::{Report, SimulationReport};
-use lineslam::output::svg::Caption;
+use lineslam::output::svg::Scene;
 use lineslam::output::{self, csv, grid, svg, tum};
 use lineslam::replay::{self, Replay, ReplayError};
 use lineslam::robot::Robot;
-use lineslam::sim::world::{Edge, World};
+use lineslam::sim::world::World;
 use lineslam::sim::{self, BadSetting, SimConfig, judge};
 use lineslam::toml_file::FileError;
 use slam_core::SlamConfig;
@@ -34,6 +35,8 @@ enum Command {
     Replay(ReplayArgs),
     /// Drive a simulated robot through a world and see how well it maps it.
     Simulate(SimulateArgs),
+    /// Run the paper's experiments and more, and write the page with tables and figures.
+    Experiments(ExperimentsArgs),
 }
 
 #[derive(Args)]
@@ -80,6 +83,25 @@ struct SimulateArgs {
     settings: Vec<String>,
 }
 
+#[derive(Args)]
+struct ExperimentsArgs {
+    /// Drives of each building.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    seeds: u32,
+    /// Seed of the first drive; the others follow.
+    #[arg(long, default_value_t = 101)]
+    first_seed: u64,
+    /// Folder of the worlds hall, corridor, office and parallel.
+    #[arg(long, value_name = "FOLDER", default_value = "worlds")]
+    worlds: PathBuf,
+    /// Folder of recorded logs with their references; without it that part is left out.
+    #[arg(long, value_name = "FOLDER", env = "LINESLAM_DATA")]
+    data: Option<PathBuf>,
+    /// Folder for experiments.md and images/.
+    #[arg(long, value_name = "FOLDER", default_value = "docs")]
+    out: PathBuf,
+}
+
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Configuration {
     Default,
@@ -106,6 +128,7 @@ fn main() -> ExitCode {
     let done = match Cli::parse().command {
         Command::Replay(args) => replay(&args),
         Command::Simulate(args) => simulate(&args),
+        Command::Experiments(args) => run_experiments(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -114,7 +137,8 @@ fn main() -> ExitCode {
             let bad_input = error.is::<log::LogError>()
                 || error.is::<FileError>()
                 || error.is::<ReplayError>()
-                || error.is::<BadSetting>();
+                || error.is::<BadSetting>()
+                || error.is::<ExperimentError>();
             ExitCode::from(if bad_input { 2 } else { 1 })
         }
     }
@@ -129,7 +153,8 @@ fn replay(args: &ReplayArgs) -> anyhow::Result<()> {
     let result = run(&log, &robot, args.config)?;
     let report = Report::new(&log, &robot, args.config.name(), &result);
     let name = args.log.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-    let files = results(&result, &report, &name, &[])?;
+    let scene = Scene { title: &name, configuration: args.config.name(), ..Scene::default() };
+    let files = results(&result, &report, &scene)?;
     output::write_all(&args.out, &files)?;
     print_summary("log", &args.log.display().to_string(), &args.out, &report);
     Ok(())
@@ -147,7 +172,14 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let mut report = Report::new(&drive.log, &robot, args.config.name(), &result);
     report.simulation = Some(SimulationReport::new(&world, &drive, &result, args.seed, errors));
     let caption = format!("{}, seed {}", world.name, args.seed);
-    let mut files = results(&result, &report, &caption, &judge::blueprint_in_map(&world, &drive))?;
+    let blueprint = judge::blueprint_in_map(&world, &drive);
+    let scene = Scene {
+        title: &caption,
+        configuration: args.config.name(),
+        blueprint: &blueprint,
+        ..Scene::default()
+    };
+    let mut files = results(&result, &report, &scene)?;
     files.push(("log.dat", sim::mines_text(&drive.log).into_bytes()));
     let stamps = drive.log.scans.iter().map(|s| s.stamp_us);
     files.push(("truth.tum", tum::render_f64(stamps.zip(&drive.truth)).into_bytes()));
@@ -156,8 +188,37 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+fn run_experiments(args: &ExperimentsArgs) -> anyhow::Result<()> {
+    let seeds = args.first_seed..args.first_seed.saturating_add(u64::from(args.seeds));
+    let options = experiments::Options { worlds: args.worlds.clone(), data: args.data.clone(), seeds };
+    let progress = progress_bar(experiments::steps(&options), "drives");
+    let results = experiments::run(&options, || progress.inc(1))?;
+    progress.finish_and_clear();
+    let with_data = if results.recorded.is_empty() { "" } else { " --data LOGS" };
+    let command = format!(
+        "cargo run --release -p lineslam -- experiments --seeds {} --first-seed {}{with_data}",
+        args.seeds, args.first_seed
+    );
+    let page = document::render(&results, &command, "images");
+    let mut files: Vec<(PathBuf, Vec<u8>)> = vec![("experiments.md".into(), page.into_bytes())];
+    files.extend(
+        results
+            .figures
+            .iter()
+            .map(|(name, text)| (Path::new("images").join(name), text.clone().into_bytes())),
+    );
+    output::write_all(&args.out, &files)?;
+    println!("{}\n\n{}", document::buildings(&results), document::robustness(&results));
+    println!("\n{}\n\n{}", document::honesty(&results), document::featureless(&results));
+    if !results.recorded.is_empty() {
+        println!("\n{}", document::recorded(&results.recorded));
+    }
+    println!("\nwritten to {}", args.out.join("experiments.md").display());
+    Ok(())
+}
+
 fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Replay, ReplayError> {
-    let progress = progress_bar(log.scans.len());
+    let progress = progress_bar(log.scans.len(), "scans");
     let result = replay::run(log, robot, configuration.config(), || progress.inc(1))?;
     progress.finish_and_clear();
     Ok(result)
@@ -167,16 +228,14 @@ fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Replay,
 fn results(
     result: &Replay,
     report: &Report,
-    name: &str,
-    blueprint: &[Edge],
+    scene: &Scene<'_>,
 ) -> anyhow::Result<Vec<(&'static str, Vec<u8>)>> {
-    let caption = Caption { log: name, configuration: &report.configuration };
     let grid = grid::render(result).context("map.pgm")?;
     Ok(vec![
         ("trajectory.tum", tum::render(replay::trajectory(&result.steps)).into_bytes()),
         ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),
         ("map.csv", csv::render(&result.map).context("map.csv")?),
-        ("map.svg", svg::render(result, &caption, blueprint).into_bytes()),
+        ("map.svg", svg::render(result, scene).into_bytes()),
         ("map.pgm", grid.pgm),
         ("map.yaml", grid.yaml.into_bytes()),
         ("report.json", report.render().context("report.json")?),
@@ -184,15 +243,15 @@ fn results(
 }
 
 /// A bar on a terminal, nothing in a pipe.
-fn progress_bar(scans: usize) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40.cyan/dim} {pos}/{len} scans  {per_sec}  {eta} left")
+fn progress_bar(steps: usize, what: &'static str) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:40.cyan/dim} {pos}/{len} {msg}  {per_sec}  {eta} left")
         .expect("the template is a constant");
     let target = if std::io::stderr().is_terminal() {
         ProgressDrawTarget::stderr()
     } else {
         ProgressDrawTarget::hidden()
     };
-    ProgressBar::with_draw_target(Some(scans as u64), target).with_style(style)
+    ProgressBar::with_draw_target(Some(steps as u64), target).with_style(style).with_message(what)
 }
 
 fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {

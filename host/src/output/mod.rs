@@ -30,24 +30,25 @@ pub struct WriteError {
     pub source: std::io::Error,
 }
 
-/// Writes named files into a folder, which is made if needed. All contents are on disk under temporary names before the
-/// first one gets its own.
-pub fn write_all(folder: &Path, files: &[(&str, Vec<u8>)]) -> Result<(), WriteError> {
+/// Writes named files into a folder; folders that are missing are made. All contents are on disk under temporary names
+/// before the first one gets its own.
+pub fn write_all<N: AsRef<Path>>(folder: &Path, files: &[(N, Vec<u8>)]) -> Result<(), WriteError> {
     let failed = |path: &Path| {
         let path = path.to_owned();
         move |source| WriteError { path, source }
     };
-    std::fs::create_dir_all(folder).map_err(failed(folder))?;
     let mut written = Vec::new();
     for (name, bytes) in files {
         let path = folder.join(name);
         if path.is_dir() {
             return Err(WriteError { path, source: std::io::ErrorKind::IsADirectory.into() });
         }
+        let parent = path.parent().unwrap_or(folder);
+        std::fs::create_dir_all(parent).map_err(failed(parent))?;
         let mut file = tempfile::Builder::new()
-            .prefix(&format!(".{name}."))
+            .prefix(".writing-")
             .permissions(file_mode())
-            .tempfile_in(folder)
+            .tempfile_in(parent)
             .map_err(failed(&path))?;
         file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(failed(&path))?;
         written.push((file, path));

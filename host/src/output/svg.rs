@@ -36,12 +36,17 @@ const LEAST_WIDTH_PX: f32 = 1200.0;
 /// Scan points are thinned to one a cell of this size, metres, and drawn up to this range.
 const POINT_CELL_M: f32 = 0.04;
 
-/// What the title says.
-pub struct Caption<'a> {
-    /// Name of the log.
-    pub log: &'a str,
+/// What is drawn beside map and path.
+#[derive(Default)]
+pub struct Scene<'a> {
+    /// The title: name of the log or of the world.
+    pub title: &'a str,
     /// Name of the configuration.
     pub configuration: &'a str,
+    /// The true walls in `map`, where they are known.
+    pub blueprint: &'a [Edge],
+    /// The trajectory to compare with, in `map`, where there is one.
+    pub reference: &'a [Isometry2<f32>],
 }
 
 /// Where `map` lies on the paper.
@@ -55,7 +60,7 @@ struct View {
 }
 
 impl View {
-    fn around(replay: &Replay, blueprint: &[Edge]) -> Self {
+    fn around(replay: &Replay, scene: &Scene<'_>) -> Self {
         let mut points: Vec<Point2<f32>> = Vec::new();
         points.extend(
             replay
@@ -64,7 +69,7 @@ impl View {
                 .filter(|s| s.hits >= ESTABLISHED_HITS)
                 .flat_map(|s| [s.segment.start, s.segment.end]),
         );
-        points.extend(blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
+        points.extend(scene.blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
         points.extend(replay.steps.iter().map(|s| Point2::from(s.pose_in_final_map.translation.vector)));
         let (low, high) = bounds(points.into_iter());
         // At least two metres, so that a robot that stands still has a picture too.
@@ -90,8 +95,8 @@ impl View {
 }
 
 /// Renders the drawing, over the blueprint where there is one.
-pub fn render(replay: &Replay, caption: &Caption<'_>, blueprint: &[Edge]) -> String {
-    let view = View::around(replay, blueprint);
+pub fn render(replay: &Replay, scene: &Scene<'_>) -> String {
+    let view = View::around(replay, scene);
     let document = Document::new()
         .set("viewBox", (0, 0, view.width_px.round() as i32, view.height_px.round() as i32))
         .set("width", view.width_px.round())
@@ -99,13 +104,14 @@ pub fn render(replay: &Replay, caption: &Caption<'_>, blueprint: &[Edge]) -> Str
         .set("font-family", FONT)
         .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", PAPER))
         .add(metre_grid(&view))
-        .add(blueprint_lines(blueprint, &view))
+        .add(blueprint_lines(scene.blueprint, &view))
         .add(scan_points(replay, &view))
         .add(dead_reckoning(replay, &view))
         .add(walls(&replay.map, &view))
+        .add(reference_path(scene.reference, &view))
         .add(path(replay, &view))
-        .add(header(replay, caption, &view))
-        .add(footer(!blueprint.is_empty(), &view));
+        .add(header(replay, scene, &view))
+        .add(footer(scene, &view));
     format!("{document}\n")
 }
 
@@ -208,6 +214,11 @@ fn polyline<'a>(poses: impl Iterator<Item = &'a Isometry2<f32>>, view: &View) ->
     d
 }
 
+fn reference_path(reference: &[Isometry2<f32>], view: &View) -> Path {
+    let path = Path::new().set("d", polyline(reference.iter(), view)).set("stroke", START);
+    path.set("stroke-width", 1.6).set("stroke-linejoin", "round").set("fill", "none")
+}
+
 fn dead_reckoning(replay: &Replay, view: &View) -> Path {
     Path::new()
         .set("d", polyline(replay.steps.iter().map(|s| &s.odometry), view))
@@ -266,11 +277,11 @@ fn label(x: f32, y: f32, size: u32, text: impl Into<String>) -> Text {
     Text::new(text).set("x", x).set("y", y).set("font-size", size).set("fill", INK)
 }
 
-fn header(replay: &Replay, caption: &Caption<'_>, view: &View) -> Group {
-    let title = label(MARGIN_PX, 38.0, 24, caption.log).set("font-weight", 700);
+fn header(replay: &Replay, scene: &Scene<'_>, view: &View) -> Group {
+    let title = label(MARGIN_PX, 38.0, 24, scene.title).set("font-weight", 700);
     let facts = format!(
         "{} configuration · {} scans · {:.0} m driven · {} segments",
-        caption.configuration,
+        scene.configuration,
         replay.steps.len(),
         replay.distance_m,
         replay.map.len(),
@@ -285,7 +296,7 @@ fn header(replay: &Replay, caption: &Caption<'_>, view: &View) -> Group {
 }
 
 /// Scale bar on the left, legend on the right.
-fn footer(has_blueprint: bool, view: &View) -> Group {
+fn footer(scene: &Scene<'_>, view: &View) -> Group {
     let y = view.height_px - 24.0;
     let metres = scale_step(view);
     let length_px = metres * view.px_per_m;
@@ -301,8 +312,11 @@ fn footer(has_blueprint: bool, view: &View) -> Group {
         ("seen once or twice", WALL, 0.4 * wall_width(view), "", 164.0),
         ("scan points", FAINT, 2.0, "0.5 5", 100.0),
     ];
-    if has_blueprint {
+    if !scene.blueprint.is_empty() {
         entries.push(("blueprint", BLUEPRINT, 8.0, "", 80.0));
+    }
+    if !scene.reference.is_empty() {
+        entries.push(("reference", START, 1.6, "", 80.0));
     }
     let mut x = view.width_px - MARGIN_PX - entries.iter().map(|e| e.4 + 32.0).sum::<f32>() + 14.0;
     for (name, colour, width, dashes, text_px) in entries {

@@ -5,7 +5,7 @@ use slam_core::{MapSegment, Segment};
 
 use super::Drive;
 use super::world::{Disc, Edge, World};
-use crate::replay::Replay;
+use crate::replay::{Replay, Step};
 use crate::score::{StampedPosition, absolute_trajectory_error};
 
 /// A map line stands for a blueprint wall when it passes this close to the corner, metres, …
@@ -18,6 +18,9 @@ const WALL_REACH_M: f64 = 1.0;
 const SPURIOUS_M: f64 = 0.15;
 /// Map segments seen in fewer scans are not yet part of the map that is judged.
 const ESTABLISHED_HITS: u16 = 3;
+
+/// Instants of a drive at which the pose's error is held against its covariance.
+pub const NEES_INSTANTS: usize = 50;
 
 /// The measures of one simulated drive.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -33,10 +36,23 @@ pub struct Judgement {
     pub ate_rmse_m: f64,
     /// Distance of the last pose from the truth, metres, in the frame of the start.
     pub final_position_error_m: f64,
+    /// Error of the last heading, degrees.
+    pub final_heading_error_deg: f64,
     /// Largest distance of a pose from the truth, metres, in the frame of the start.
     pub worst_position_error_m: f64,
+    /// Largest error of a heading, degrees.
+    pub worst_heading_error_deg: f64,
+    /// Largest error of a position across the robot's heading, metres.
+    pub worst_across_error_m: f64,
+    /// Error of the last position along the robot's heading, metres.
+    pub final_along_error_m: f64,
+    /// Share of the poses whose error along the robot's heading is within two of its reported standard deviations.
+    pub along_within_two_sigma: f64,
     /// Mean of the normalised estimation error squared of the pose (3 is honest).
     pub mean_nees: f64,
+    /// The same at [`NEES_INSTANTS`] instants, equally far apart.
+    #[serde(skip)]
+    pub nees: Vec<f64>,
     /// Map segments seen in at least three scans.
     pub established_segments: usize,
     /// Those of them that are far from everything that stands still.
@@ -50,6 +66,10 @@ pub struct TrajectoryErrors {
     pub ate_rmse_m: f64,
     /// Distance of the last pose from the truth, metres.
     pub final_position_error_m: f64,
+    /// Error of the last heading, degrees.
+    pub final_heading_error_deg: f64,
+    /// Error of the last position along the robot's heading, metres.
+    pub final_along_error_m: f64,
 }
 
 /// Errors of poses that begin at the truth's start.
@@ -61,11 +81,12 @@ pub fn trajectory_errors(truth: &[Isometry2<f64>], poses: &[Isometry2<f64>]) -> 
         };
         poses.iter().enumerate().map(at).collect()
     };
-    let last = truth.last().zip(poses.last());
+    let last = truth.last().zip(poses.last()).map(|(truth, pose)| truth.inv_mul(pose));
     TrajectoryErrors {
         ate_rmse_m: absolute_trajectory_error(&stamped(poses), &stamped(truth)).unwrap_or(f64::NAN),
-        final_position_error_m: last
-            .map_or(f64::NAN, |(t, p)| (t.translation.vector - p.translation.vector).norm()),
+        final_position_error_m: last.map_or(f64::NAN, |off| off.translation.vector.norm()),
+        final_heading_error_deg: last.map_or(f64::NAN, |off| off.rotation.angle().abs().to_degrees()),
+        final_along_error_m: last.map_or(f64::NAN, |off| off.translation.x.abs()),
     }
 }
 
@@ -79,24 +100,38 @@ pub fn in_world(drive: &Drive, poses: impl Iterator<Item = Isometry2<f32>>) -> V
 pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
     let poses = in_world(drive, replay.steps.iter().map(|s| s.pose));
     let errors = trajectory_errors(&drive.truth, &poses);
-    let distances =
-        drive.truth.iter().zip(&poses).map(|(t, p)| (t.translation.vector - p.translation.vector).norm());
+    let off: Vec<PoseError> = drive.truth.iter().zip(&poses).map(|(t, p)| PoseError::new(t, p)).collect();
+    let worst = |size: fn(&PoseError) -> f64| off.iter().map(size).fold(0.0, f64::max);
+    let covariances: Vec<Matrix3<f64>> = replay
+        .steps
+        .iter()
+        .zip(&drive.truth)
+        .map(|(step, truth)| covariance_in_base(drive, step, truth))
+        .collect();
+    let nees = |k: usize| off.get(k)?.normalised(covariances.get(k)?);
+    let all_nees: Vec<f64> = (0..off.len()).filter_map(nees).collect();
+    let last = off.len().saturating_sub(1);
     let map = map_in_world(drive, &replay.map);
     let found: Vec<f64> =
         world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), &map)).collect();
     let (edges, discs) = (world.edges(), world.discs());
     let established: Vec<&Segment> =
         map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
-    let nees: Vec<f64> =
-        (0..poses.len()).filter_map(|k| normalised_error(drive, replay, &poses, k)).collect();
+    let covered = off.iter().zip(&covariances).filter(|(off, p)| off.along_m.powi(2) <= 4.0 * p.m11);
     Judgement {
         corner_error_m: (!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64),
         corners_found: found.len(),
         corners: world.corners.len(),
         ate_rmse_m: errors.ate_rmse_m,
         final_position_error_m: errors.final_position_error_m,
-        worst_position_error_m: distances.fold(0.0, f64::max),
-        mean_nees: nees.iter().sum::<f64>() / nees.len().max(1) as f64,
+        final_heading_error_deg: errors.final_heading_error_deg,
+        worst_position_error_m: worst(|off| off.along_m.hypot(off.across_m)),
+        worst_heading_error_deg: worst(|off| off.heading_rad.abs()).to_degrees(),
+        worst_across_error_m: worst(|off| off.across_m.abs()),
+        final_along_error_m: errors.final_along_error_m,
+        along_within_two_sigma: covered.count() as f64 / off.len().max(1) as f64,
+        mean_nees: all_nees.iter().sum::<f64>() / all_nees.len().max(1) as f64,
+        nees: (1..=NEES_INSTANTS).filter_map(|i| nees(i * last / NEES_INSTANTS)).collect(),
         established_segments: established.len(),
         spurious_segments: established.iter().filter(|s| is_spurious(s, &edges, &discs)).count(),
     }
@@ -118,16 +153,31 @@ pub fn blueprint_in_map(world: &World, drive: &Drive) -> Vec<Edge> {
     world.edges().into_iter().map(carried).collect()
 }
 
-/// Normalised estimation error squared of pose `k`: eᵀP⁻¹e.
-fn normalised_error(drive: &Drive, replay: &Replay, poses: &[Isometry2<f64>], k: usize) -> Option<f64> {
-    let (truth, pose, step) = (drive.truth.get(k)?, poses.get(k)?, replay.steps.get(k)?);
-    // The covariance is in `map`, the error is carried there.
-    let start = drive.truth.first()?;
-    let off = start.rotation.inverse() * (pose.translation.vector - truth.translation.vector);
-    let turn = (truth.rotation.inverse() * pose.rotation).angle();
-    let error = Vector3::new(off.x, off.y, turn);
-    let covariance: Matrix3<f64> = nalgebra::convert(step.update.covariance);
-    Some(error.dot(&(covariance.try_inverse()? * error)))
+/// Error of one pose, in the true `base`.
+struct PoseError {
+    along_m: f64,
+    across_m: f64,
+    heading_rad: f64,
+}
+
+impl PoseError {
+    fn new(truth: &Isometry2<f64>, pose: &Isometry2<f64>) -> Self {
+        let off = truth.inv_mul(pose);
+        Self { along_m: off.translation.x, across_m: off.translation.y, heading_rad: off.rotation.angle() }
+    }
+
+    /// Normalised estimation error squared eᵀP⁻¹e; `None` where P is singular, as at the first pose.
+    fn normalised(&self, covariance: &Matrix3<f64>) -> Option<f64> {
+        let error = Vector3::new(self.along_m, self.across_m, self.heading_rad);
+        Some(error.dot(&(covariance.try_inverse()? * error)))
+    }
+}
+
+/// The covariance that a step reported in `map`, in the true `base`.
+fn covariance_in_base(drive: &Drive, step: &Step, truth: &Isometry2<f64>) -> Matrix3<f64> {
+    let start = drive.truth.first().copied().unwrap_or_else(Isometry2::identity);
+    let turn = (truth.rotation.inverse() * start.rotation).to_rotation_matrix().to_homogeneous();
+    turn * nalgebra::convert::<_, Matrix3<f64>>(step.update.covariance) * turn.transpose()
 }
 
 /// Distance between a corner of the blueprint and the crossing of the map's lines for the two walls that meet there.

@@ -1,0 +1,54 @@
+//! The figures: map over blueprint or reference, and what dead reckoning would have drawn.
+
+use nalgebra::{Isometry2, Vector2};
+use slam_core::SlamConfig;
+
+use crate::log::Log;
+use crate::output::svg::{self, Scene};
+use crate::replay::{self, Replay, ReplayError, Step};
+use crate::robot::Robot;
+use crate::score::{self, StampedPosition};
+use crate::sim::world::World;
+use crate::sim::{self, SimConfig, judge};
+
+/// The map of a simulated drive over its blueprint, with the true path; for the hall also as dead reckoning has it.
+pub fn simulated(world: &World, seed: u64) -> Result<Vec<(String, String)>, ReplayError> {
+    let robot = Robot::usual_for("simulated");
+    let drive = sim::drive(world, &robot, &SimConfig::default(), seed)?;
+    let replay = replay::run(&drive.log, &robot, SlamConfig::default(), || {})?;
+    let blueprint = judge::blueprint_in_map(world, &drive);
+    let map_from_world = drive.truth.first().map_or_else(Isometry2::identity, Isometry2::inverse);
+    let truth: Vec<Isometry2<f32>> =
+        drive.truth.iter().map(|pose| nalgebra::convert_unchecked(map_from_world * pose)).collect();
+    let title = format!("{}, seed {seed}", world.name);
+    let draw = |replay: &Replay, configuration: &str| {
+        svg::render(replay, &Scene { title: &title, configuration, blueprint: &blueprint, reference: &truth })
+    };
+    let mut figures = vec![(format!("{}.svg", world.name), draw(&replay, "default"))];
+    if world.name == "hall" {
+        figures.push((format!("{}_dead_reckoning.svg", world.name), draw(&by_wheels(replay), "no")));
+    }
+    Ok(figures)
+}
+
+/// The map of a recorded log, with the reference trajectory laid on it.
+pub fn recorded(name: &str, log: &Log, replay: &Replay, reference: &[StampedPosition]) -> (String, String) {
+    let positions = super::stamped(replay::trajectory(&replay.steps));
+    let reference: Vec<Isometry2<f32>> = score::align(reference, &positions)
+        .map(|alignment| {
+            let carried =
+                |p: &StampedPosition| alignment.reference_from_estimate * nalgebra::Point2::from(p.position);
+            let pose = |p: nalgebra::Point2<f64>| Isometry2::new(Vector2::new(p.x as f32, p.y as f32), 0.0);
+            reference.iter().map(carried).map(pose).collect()
+        })
+        .unwrap_or_default();
+    let title = format!("{name} ({})", log.format);
+    let scene = Scene { title: &title, configuration: "default", reference: &reference, ..Scene::default() };
+    (format!("{name}.svg"), svg::render(replay, &scene))
+}
+
+/// The same scans where the wheels say they were taken, without a map.
+fn by_wheels(replay: Replay) -> Replay {
+    let moved = |step: Step| Step { pose: step.odometry, pose_in_final_map: step.odometry, ..step };
+    Replay { steps: replay.steps.into_iter().map(moved).collect(), map: Vec::new(), ..replay }
+}
