@@ -9,7 +9,7 @@ use crate::extraction::{ExtractionConfig, RansacConfig, SplitConfig};
 use crate::loop_closure::LoopConfig;
 use crate::odometry::{Integration, OdometryNoise};
 use crate::odometry_bias::BiasConfig;
-use crate::registration::{RegistrationConfig, SumsConfig};
+use crate::registration::{JointConfig, RegistrationConfig};
 use crate::residual::LineNoise;
 use crate::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
 use crate::visibility::ForgetConfig;
@@ -89,12 +89,7 @@ impl Default for SlamConfig {
             odometry: OdometryConfig {
                 integration: Integration::Arc,
                 noise: ODOMETRY_NOISE,
-                bias: Some(BiasConfig {
-                    sigma_distance: 0.01,
-                    sigma_turn: 0.01,
-                    sigma_turn_per_m: 0.005,
-                    most_sigmas: 3.0,
-                }),
+                bias: Some(BiasConfig { sigma_distance: 0.01, sigma_turn: 0.01, sigma_turn_per_m: 0.005 }),
             },
             deskew: DeskewConfig { enabled: true },
             extraction: ExtractionConfig::Split(SplitConfig {
@@ -102,7 +97,7 @@ impl Default for SlamConfig {
                 min_incidence_rad: 0.17,
                 max_missing_beams: 4,
                 split_sigmas: 4.0,
-                merge_chi2: 1.0,
+                merge_chi2: 0.6,
                 trim_sigmas: 2.5,
                 max_mean_chi2: 2.0,
                 min_inliers: 6,
@@ -129,17 +124,19 @@ impl Default for SlamConfig {
                 min_way_m: 20.0,
                 sigma_position_m_per_sqrt_m: 0.05,
                 sigma_heading_rad_per_sqrt_m: 0.004,
-                min_support: 0.6,
+                min_support: 0.8,
                 min_chi2: 9.0,
+                max_chi2: 16.0,
                 confirmations: 4,
                 same_position_m: 0.1,
                 same_heading_rad: 0.03,
             }),
-            forgetting: Some(ForgetConfig { margin_m: 0.3, margin_sigmas: 3.0, min_sine: 0.3, scans: 5 }),
-            registration: RegistrationConfig::Sums(SumsConfig {
-                max_chi2: 9.2,
-                max_sigma_offset_m: 0.05,
-                max_sigma_direction_rad: 0.03,
+            forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 5 }),
+            registration: RegistrationConfig::Joint(JointConfig {
+                max_chi2: 60.0,
+                kernel_chi2: 1.5,
+                young_hits: 4,
+                young_scans_per_hit: 2.1,
                 fuse_max_angle_rad: 0.1,
                 fuse_max_distance_m: 0.25,
                 fuse_gap_m: 0.2,
@@ -213,7 +210,6 @@ impl SlamConfig {
             not_negative("odometry.bias.sigma_distance", b.sigma_distance)?;
             not_negative("odometry.bias.sigma_turn", b.sigma_turn)?;
             not_negative("odometry.bias.sigma_turn_per_m", b.sigma_turn_per_m)?;
-            not_negative("odometry.bias.most_sigmas", b.most_sigmas)?;
         }
         Ok(())
     }
@@ -269,6 +265,7 @@ impl SlamConfig {
             not_negative("loop_closure.sigma_heading_rad_per_sqrt_m", c.sigma_heading_rad_per_sqrt_m)?;
             not_negative("loop_closure.min_support", c.min_support)?;
             not_negative("loop_closure.min_chi2", c.min_chi2)?;
+            positive("loop_closure.max_chi2", c.max_chi2)?;
             check("loop_closure.confirmations", c.confirmations > 0)?;
             not_negative("loop_closure.same_position_m", c.same_position_m)?;
             not_negative("loop_closure.same_heading_rad", c.same_heading_rad)?;
@@ -279,17 +276,17 @@ impl SlamConfig {
             check("forgetting.min_sine", (0.0..=1.0).contains(&c.min_sine))?;
             check("forgetting.scans", c.scans > 0)?;
         }
-        if let RegistrationConfig::Sums(c) = &self.registration {
-            positive("registration.sums.max_chi2", c.max_chi2)?;
-            not_negative("registration.sums.max_sigma_offset_m", c.max_sigma_offset_m)?;
-            not_negative("registration.sums.max_sigma_direction_rad", c.max_sigma_direction_rad)?;
-            positive("registration.sums.fuse_max_angle_rad", c.fuse_max_angle_rad)?;
-            positive("registration.sums.fuse_max_distance_m", c.fuse_max_distance_m)?;
-            positive("registration.sums.fuse_sigmas", c.fuse_sigmas)?;
-            not_negative("registration.sums.fuse_gap_m", c.fuse_gap_m)?;
-            not_negative("registration.sums.fuse_max_gap_m", c.fuse_max_gap_m)?;
-            positive("registration.sums.fuse_chi2", c.fuse_chi2)?;
-            positive("registration.sums.fuse_overlap", c.fuse_overlap)?;
+        if let RegistrationConfig::Joint(c) = &self.registration {
+            positive("registration.joint.max_chi2", c.max_chi2)?;
+            positive("registration.joint.kernel_chi2", c.kernel_chi2)?;
+            not_negative("registration.joint.young_scans_per_hit", c.young_scans_per_hit)?;
+            positive("registration.joint.fuse_max_angle_rad", c.fuse_max_angle_rad)?;
+            positive("registration.joint.fuse_max_distance_m", c.fuse_max_distance_m)?;
+            positive("registration.joint.fuse_sigmas", c.fuse_sigmas)?;
+            not_negative("registration.joint.fuse_gap_m", c.fuse_gap_m)?;
+            not_negative("registration.joint.fuse_max_gap_m", c.fuse_max_gap_m)?;
+            positive("registration.joint.fuse_chi2", c.fuse_chi2)?;
+            positive("registration.joint.fuse_overlap", c.fuse_overlap)?;
         }
         Ok(())
     }

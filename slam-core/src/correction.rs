@@ -72,6 +72,8 @@ pub struct Observability {
     pub weak_direction: Vector2<f32>,
     /// Standard deviation along that direction from the pairs alone, metres; infinite when they say nothing.
     pub weak_sigma_m: f32,
+    /// Share of the information along that direction that uncertain line directions do not explain, 0 to 1.
+    pub trusted_share: f32,
     /// The judgement.
     pub verdict: Verdict,
 }
@@ -94,8 +96,16 @@ impl Observability {
         eigenvalues: [0.0; 3],
         weak_direction: Vector2::new(1.0, 0.0),
         weak_sigma_m: f32::INFINITY,
+        trusted_share: 0.0,
         verdict: Verdict::Blind,
     };
+
+    /// The matrix T that turns a derivative J by the position into J·T, so that the weak direction keeps its trusted
+    /// information only.
+    pub fn trusted(&self) -> Matrix2<f32> {
+        let v = self.weak_direction;
+        Matrix2::identity() - v * v.transpose() * (1.0 - sqrt(self.trusted_share))
+    }
 }
 
 /// Outcome of one correction step.
@@ -176,7 +186,8 @@ pub fn maximum_a_posteriori(
 ) -> Option<Correction> {
     let (information, gradient) = pair_sums(observed, pairs, map, at, line_noise, config);
     let observability = judge(&information, config.direction_trust_rad, config.observable_sigma_m);
-    let trust = trusted_projection(&information, &observability, config);
+    let mut trust = Matrix3::identity();
+    trust.fixed_view_mut::<2, 2>(0, 0).copy_from(&observability.trusted());
     let prior_information = prior.covariance.cholesky()?.inverse();
     let (from, to) = (components(at), components(&prior.pose));
     let mut drawn = to - from;
@@ -235,34 +246,15 @@ fn judge(information: &Matrix3<f32>, direction_trust_rad: f32, observable_sigma_
     }
     let [(strong, _), (weak, weak_direction)] = eigen2(&translation_information(information));
     let usable = usable_information(weak, strong, direction_trust_rad);
+    let trusted_share = if weak > 0.0 { usable / weak } else { 0.0 };
     let weak_sigma_m = if usable > 0.0 { 1.0 / sqrt(usable) } else { f32::INFINITY };
     let verdict = if weak_sigma_m <= observable_sigma_m { Verdict::Full } else { Verdict::Corridor };
-    Observability { eigenvalues, weak_direction, weak_sigma_m, verdict }
+    Observability { eigenvalues, weak_direction, weak_sigma_m, trusted_share, verdict }
 }
 
 /// What remains of the weak direction's information when that which uncertain line directions explain is taken out.
 fn usable_information(weak: f32, strong: f32, direction_trust_rad: f32) -> f32 {
     (weak - direction_trust_rad * direction_trust_rad * strong).max(0.0)
-}
-
-/// The matrix T that turns the pairs' Jacobian J into J·T, so that the weak direction keeps its usable information only.
-fn trusted_projection(information: &Matrix3<f32>, seen: &Observability, config: &MapConfig) -> Matrix3<f32> {
-    let [(strong, _), (weak, _)] = eigen2(&translation_information(information));
-    let share =
-        if weak > 0.0 { usable_information(weak, strong, config.direction_trust_rad) / weak } else { 0.0 };
-    let v = seen.weak_direction;
-    let off = 1.0 - sqrt(share);
-    Matrix3::new(
-        1.0 - off * v.x * v.x,
-        -off * v.x * v.y,
-        0.0,
-        -off * v.x * v.y,
-        1.0 - off * v.y * v.y,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )
 }
 
 /// Eigenvalues and unit eigenvectors of a symmetric matrix, the larger first.

@@ -71,6 +71,7 @@ pub mod config;
 pub mod correction;
 pub mod deskew;
 pub mod extraction;
+pub mod joint;
 pub mod loop_closure;
 pub mod map;
 pub mod math;

@@ -74,45 +74,48 @@ impl<const N: usize> SegmentMap<N> {
         self.segments.get_mut(index)
     }
 
-    /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns whether it found a place. Work: `N` steps when full.
-    pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> bool {
+    /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns its index, if it
+    /// found a place. Work: `N` steps when full.
+    pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> Option<usize> {
         let entry = MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m };
         if self.segments.push(entry).is_ok() {
             self.counters.added = self.counters.added.saturating_add(1);
-            return true;
+            return Some(self.segments.len() - 1);
         }
-        let stale = self.segments.iter_mut().filter(|s| s.last_seen != seen);
-        let Some(least) = stale.min_by_key(|s| (s.hits, s.last_seen)) else {
+        let stale = self.segments.iter_mut().enumerate().filter(|(_, s)| s.last_seen != seen);
+        let Some((index, least)) = stale.min_by_key(|(_, s)| (s.hits, s.last_seen)) else {
             self.counters.refused = self.counters.refused.saturating_add(1);
-            return false;
+            return None;
         };
         *least = entry;
         self.counters.evicted = self.counters.evicted.saturating_add(1);
         self.counters.added = self.counters.added.saturating_add(1);
-        true
+        Some(index)
     }
 
-    /// Joins segment `other` to segment `index` and removes it; the last segment takes the place of `other`.
-    pub(crate) fn fuse(&mut self, index: usize, other: usize) {
-        if index == other {
+    /// Ends segment `gone`, which has become one with segment `kept`; the last segment takes its place.
+    pub(crate) fn fuse(&mut self, kept: usize, gone: usize) {
+        if kept == gone || gone >= self.segments.len() {
             return;
         }
-        let Some(taken) = self.segments.get(other).copied() else { return };
+        let taken = self.segments.swap_remove(gone);
+        let index = if kept == self.segments.len() { gone } else { kept };
         let Some(kept) = self.segments.get_mut(index) else { return };
-        kept.segment = kept.segment.merged(&taken.segment);
+        kept.segment = kept.segment.extended([taken.segment.start, taken.segment.end]);
+        kept.segment.moments.inliers =
+            kept.segment.moments.inliers.saturating_add(taken.segment.moments.inliers);
         kept.hits = kept.hits.max(taken.hits);
         kept.last_seen = kept.last_seen.max(taken.last_seen);
         kept.seen_at_m = kept.seen_at_m.max(taken.seen_at_m);
-        self.segments.swap_remove(other);
         self.counters.fused = self.counters.fused.saturating_add(1);
     }
 
-    /// Forgets the segments that do not stay.
-    pub(crate) fn retain(&mut self, stays: impl FnMut(&MapSegment) -> bool) {
-        let before = self.segments.len();
-        self.segments.retain(stays);
-        let gone = (before - self.segments.len()) as u32;
-        self.counters.forgotten = self.counters.forgotten.saturating_add(gone);
+    /// Forgets a segment; the last one takes its place.
+    pub(crate) fn forget(&mut self, index: usize) {
+        if index < self.segments.len() {
+            self.segments.swap_remove(index);
+            self.counters.forgotten = self.counters.forgotten.saturating_add(1);
+        }
     }
 
     /// All segments, to be moved.
@@ -141,10 +144,10 @@ mod tests {
     fn a_full_map_drops_the_segment_seen_least_and_longest_ago() {
         let mut map = SegmentMap::<3>::new();
         for (x, scan) in [(1.0, 5), (2.0, 3), (3.0, 4)] {
-            assert!(map.insert(segment(x), scan, 0.0));
+            assert!(map.insert(segment(x), scan, 0.0).is_some());
         }
         map.get_mut(0).unwrap().hits = 9;
-        assert!(map.insert(segment(4.0), 6, 0.0));
+        assert_eq!(map.insert(segment(4.0), 6, 0.0), Some(1));
         let kept: std::vec::Vec<f32> = map.segments().iter().map(|s| s.segment.start.x).collect();
         assert_eq!(kept, [1.0, 4.0, 3.0]);
         assert_eq!(map.counters().evicted, 1);
@@ -154,11 +157,11 @@ mod tests {
     fn segments_of_the_scan_at_hand_are_never_dropped() {
         let mut map = SegmentMap::<2>::new();
         for x in [1.0, 2.0] {
-            assert!(map.insert(segment(x), 7, 0.0));
+            assert!(map.insert(segment(x), 7, 0.0).is_some());
         }
-        assert!(!map.insert(segment(3.0), 7, 0.0));
+        assert!(map.insert(segment(3.0), 7, 0.0).is_none());
         assert_eq!(map.counters(), MapCounters { added: 2, refused: 1, ..MapCounters::default() });
-        assert!(!SegmentMap::<0>::new().insert(segment(1.0), 1, 0.0), "a map without room refuses");
+        assert!(SegmentMap::<0>::new().insert(segment(1.0), 1, 0.0).is_none(), "a map without room refuses");
     }
 
     #[test]

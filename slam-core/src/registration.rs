@@ -8,13 +8,15 @@
 //! segments that turn out to be one wall.
 
 use heapless::{Vec, VecView};
-use nalgebra::Isometry2;
+use nalgebra::{Isometry2, Point2};
 
-use crate::association::{Pair, View};
+use crate::association::Pair;
 use crate::extraction::MAX_SEGMENTS;
+use crate::joint::{Joint, Measurement, variances, with_variances};
 use crate::map::{MapSegment, SegmentMap};
-use crate::pose::{cross, perpendicular};
-use crate::residual::Residual;
+use crate::math::wrap_angle;
+use crate::pose::{components, cross};
+use crate::residual::{LineNoise, Residual};
 use crate::segment::{Moments, Segment};
 
 /// How segments enter the map.
@@ -24,22 +26,24 @@ use crate::segment::{Moments, Segment};
 pub enum RegistrationConfig {
     /// Fig. 6 of the paper.
     EndPoints,
-    /// Sums are added, walls fused.
-    Sums(SumsConfig),
+    /// Lines are estimated together with the pose, walls fused.
+    Joint(JointConfig),
 }
 
-/// Settings of the registration by sums.
+/// Settings of the joint estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct SumsConfig {
-    /// A pair that fits worse than this χ² after the correction changes nothing.
+pub struct JointConfig {
+    /// A pair that fits worse than this χ² changes nothing.
     pub max_chi2: f32,
-    /// The pose's uncertainty lowers the weight of what is registered up to this much across a line, metres. More of it
-    /// is common to all that is registered from there, and not an error among them.
-    pub max_sigma_offset_m: f32,
-    /// The same for the lines' directions, radians.
-    pub max_sigma_direction_rad: f32,
+    /// A pair that fits worse than this χ² counts for less: its variance grows with its χ².
+    pub kernel_chi2: f32,
+    /// A segment seen in fewer scans than this is young. A young one that is seen only now and then may be walking, or nothing:
+    /// the pose learns nothing from it.
+    pub young_hits: u16,
+    /// Now and then: in fewer than one of so many scans since it was first seen.
+    pub young_scans_per_hit: f32,
     /// Two map segments with a larger angle between them are two walls, radians.
     pub fuse_max_angle_rad: f32,
     /// Two map segments of which an end lies farther than this off the other's line are two walls, metres.
@@ -78,57 +82,147 @@ pub struct RegistrationReport {
     pub doubtful: u32,
 }
 
-/// Registers the segments of a scan, seen through `view`.
+/// What the registration is given of a scan.
+#[derive(Clone, Copy, Debug)]
+pub struct Observed<'a> {
+    /// Segments in `base`.
+    pub segments: &'a [Segment],
+    /// Those that are known.
+    pub pairs: &'a [Pair],
+    /// When they were seen.
+    pub stamp: Stamp,
+    /// Errors of lines beyond their points' noise.
+    pub line_noise: &'a LineNoise,
+}
+
+impl Observed<'_> {
+    /// The segments without a pair.
+    fn unknown(&self) -> impl Iterator<Item = &Segment> {
+        let known = |index: usize| self.pairs.iter().any(|p| p.observed == index);
+        self.segments.iter().enumerate().filter(move |(index, _)| !known(*index)).map(|(_, s)| s)
+    }
+}
+
+/// Fig. 6 of the paper: the map by the corrected pose.
 ///
-/// Work: one step for each observed segment, and for fusing one for each map segment it changed and each map segment.
-pub fn register<const N: usize>(
-    observed: &[Segment],
-    pairs: &[Pair],
-    view: &View<'_>,
-    stamp: &Stamp,
-    config: &RegistrationConfig,
+/// Work: one step for each observed segment.
+pub fn register_end_points<const N: usize>(
+    seen: &Observed<'_>,
+    pose: &Isometry2<f32>,
     map: &mut SegmentMap<N>,
 ) -> RegistrationReport {
     let mut report = RegistrationReport::default();
-    let mut is_new: Vec<bool, MAX_SEGMENTS> = Vec::new();
-    // As many observed segments as capacity: both come from the extraction.
-    let _ = is_new.resize(observed.len().min(MAX_SEGMENTS), true);
-    for pair in pairs {
-        let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get_mut(pair.mapped)) else {
+    for pair in seen.pairs {
+        let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
+        else {
             continue;
         };
-        if let Some(flag) = is_new.get_mut(pair.observed) {
-            *flag = false;
-        }
-        let joined = match config {
-            RegistrationConfig::EndPoints => {
-                Some(joined_by_end_points(&entry.segment, &seen.transformed(view.pose)))
-            }
-            RegistrationConfig::Sums(config) => joined_by_sums(&entry.segment, seen, view, config),
-        };
-        let Some(joined) = joined.filter(Segment::is_finite) else {
+        let joined = joined_by_end_points(&entry.segment, &segment.transformed(pose));
+        if !joined.is_finite() {
             report.doubtful += 1;
             continue;
-        };
+        }
         entry.segment = joined;
-        entry.hits = entry.hits.saturating_add(1);
-        entry.last_seen = stamp.scan;
-        entry.seen_at_m = stamp.way_m;
+        mark_seen(entry, &seen.stamp);
         report.matched += 1;
     }
-    for (seen, _) in observed.iter().zip(&is_new).filter(|(_, new)| **new) {
-        let segment = match config {
-            RegistrationConfig::EndPoints => seen.transformed(view.pose),
-            RegistrationConfig::Sums(config) => with_pose_uncertainty(seen, view, config),
-        };
-        if segment.is_finite() && map.insert(segment, stamp.scan, stamp.way_m) {
+    for segment in seen.unknown() {
+        let segment = segment.transformed(pose);
+        if segment.is_finite() && map.insert(segment, seen.stamp.scan, seen.stamp.way_m).is_some() {
             report.new += 1;
         }
     }
-    if let RegistrationConfig::Sums(config) = config {
-        fuse_walls(map, stamp.scan, view, config);
-    }
     report
+}
+
+fn mark_seen(entry: &mut MapSegment, stamp: &Stamp) {
+    entry.hits = entry.hits.saturating_add(1);
+    entry.last_seen = stamp.scan;
+    entry.seen_at_m = stamp.way_m;
+}
+
+/// Where the joint estimate is taken on from.
+#[derive(Clone, Copy, Debug)]
+pub struct Start<'a> {
+    /// The predicted pose, whose covariance the joint estimate has.
+    pub prior: &'a Isometry2<f32>,
+    /// The pose through which the pairs were found: the measurements are made linear there.
+    pub pose: &'a Isometry2<f32>,
+}
+
+/// Joint estimate of the pose, the odometry's errors and the lines, from the pairs of a scan; what is not known is added.
+/// Returns the pose.
+///
+/// Work: for each pair, the square of the number of states tracked; for fusing, one step for each map segment that was
+/// seen and each map segment.
+pub fn register_jointly<const N: usize>(
+    seen: &Observed<'_>,
+    start: &Start<'_>,
+    config: &JointConfig,
+    joint: &mut Joint,
+    map: &mut SegmentMap<N>,
+) -> (Isometry2<f32>, RegistrationReport) {
+    let mut report = RegistrationReport::default();
+    let mut matched: Vec<Pair, MAX_SEGMENTS> = Vec::new();
+    let position = start.prior.translation.vector;
+    let mut since_prior = components(start.pose) - components(start.prior);
+    since_prior.z = wrap_angle(since_prior.z);
+    for pair in seen.pairs {
+        let Some(segment) = seen.segments.get(pair.observed) else { continue };
+        let Some(place) = joint.track(pair.mapped, map, seen.stamp.scan) else {
+            report.doubtful += 1;
+            continue;
+        };
+        let Some(entry) = map.get_mut(pair.mapped) else { continue };
+        let length_m = segment.length_m().min(entry.segment.length_m());
+        let variances = with_line_noise(variances(segment), seen.line_noise, length_m);
+        let segment = segment.transformed(start.pose);
+        let measurement =
+            Measurement::of_pair(place, &entry.segment, &segment, position, &since_prior, variances);
+        let chi2 = joint.chi2(&measurement);
+        if chi2.is_nan() || chi2 > config.max_chi2 {
+            report.doubtful += 1;
+            continue;
+        }
+        let doubted = entry.hits < config.young_hits
+            && joint.age_scans(place) > config.young_scans_per_hit * f32::from(entry.hits);
+        let only = doubted.then_some(place);
+        joint.measure(&measurement, (chi2 / config.kernel_chi2).max(1.0), only);
+        mark_seen(entry, &seen.stamp);
+        report.matched += 1;
+        // As many pairs as observed segments at most.
+        let _ = matched.push(*pair);
+    }
+    let mut pose = joint.settle(start.prior, map);
+    for pair in &matched {
+        let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
+        else {
+            continue;
+        };
+        let moments = &mut entry.segment.moments;
+        moments.inliers = moments.inliers.saturating_add(segment.moments.inliers);
+        let longer = entry.segment.extended([pose * segment.start, pose * segment.end]);
+        if longer.is_finite() {
+            entry.segment = longer;
+        }
+    }
+    for segment in seen.unknown() {
+        let [var_offset, var_direction] =
+            with_line_noise(variances(segment), seen.line_noise, segment.length_m());
+        let segment = with_variances(&segment.transformed(&pose), var_offset, var_direction);
+        if segment.is_finite()
+            && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
+        {
+            joint.add(index, pose.translation.vector, map, seen.stamp.scan);
+            report.new += 1;
+        }
+    }
+    fuse_walls(seen, config, &mut pose, joint, map);
+    (pose, report)
+}
+
+fn with_line_noise([offset, direction]: [f32; 2], noise: &LineNoise, length_m: f32) -> [f32; 2] {
+    [offset + noise.var_offset(), direction + noise.var_direction(length_m)]
 }
 
 /// Fig. 6: the least-squares line through the four end points, n = n_m + n_g.
@@ -142,66 +236,69 @@ fn joined_by_end_points(mapped: &Segment, seen: &Segment) -> Segment {
     Segment::fitted(moments, &ends, mapped.midpoint() + mapped.normal())
 }
 
-/// The least-squares line of all points of both, if the pair fits.
-fn joined_by_sums(mapped: &Segment, seen: &Segment, view: &View<'_>, config: &SumsConfig) -> Option<Segment> {
-    let seen_in_map = with_pose_uncertainty(seen, view, config);
-    let position = view.pose.translation.vector.into();
-    let residual = Residual::new(&seen_in_map, mapped, position, view.line_noise)?;
-    let fits = residual.chi2(view.covariance) <= config.max_chi2;
-    fits.then(|| mapped.merged(&seen_in_map))
-}
-
-/// The segment in `map`, with offset and direction as uncertain as the pose and the wall's own crookedness make them.
-fn with_pose_uncertainty(seen: &Segment, view: &View<'_>, config: &SumsConfig) -> Segment {
-    let mut segment = seen.transformed(view.pose);
-    let normal = segment.normal();
-    let lever = normal.dot(&perpendicular(segment.moments.centroid.coords - view.pose.translation.vector));
-    let across = nalgebra::Vector3::new(normal.x, normal.y, lever);
-    let cap = |variance: f32, sigma: f32| variance.min(sigma * sigma);
-    let var_offset = cap(across.dot(&(view.covariance * across)), config.max_sigma_offset_m)
-        + view.line_noise.var_offset();
-    let var_direction = cap(view.covariance.m33, config.max_sigma_direction_rad)
-        + view.line_noise.var_direction(segment.length_m());
-    let scatter = segment.moments.scatter_along(segment.direction);
-    segment.moments = segment
-        .moments
-        .loosened(1.0 / (1.0 + segment.moments.weight * var_offset), 1.0 / (1.0 + scatter * var_direction));
-    segment
-}
-
 /// Fuses each map segment that this scan changed with those that are the same wall.
 fn fuse_walls<const N: usize>(
+    seen: &Observed<'_>,
+    config: &JointConfig,
+    pose: &mut Isometry2<f32>,
+    joint: &mut Joint,
     map: &mut SegmentMap<N>,
-    scan_number: u32,
-    view: &View<'_>,
-    config: &SumsConfig,
 ) {
     let mut index = 0;
     while let Some(changed) = map.segments().get(index).copied() {
-        let twin = (changed.last_seen == scan_number)
-            .then(|| {
-                map.segments()
-                    .iter()
-                    .enumerate()
-                    .find(|(i, s)| *i != index && one_wall(&changed, s, view, config))
-            })
-            .flatten()
-            .map(|(i, _)| i);
-        match twin {
-            // The grown segment is looked at again, wherever it went.
-            Some(twin) => {
-                let (kept, gone) = (index.min(twin), index.max(twin));
-                map.fuse(kept, gone);
-                index = kept;
-            }
-            None => index += 1,
+        let is_twin = |(i, s): (usize, &MapSegment)| {
+            i != index && one_wall(&changed, s, &pose.translation.vector.into(), seen.line_noise, config)
+        };
+        let twin = (changed.last_seen == seen.stamp.scan)
+            .then(|| map.segments().iter().enumerate().position(is_twin))
+            .flatten();
+        let Some(twin) = twin else {
+            index += 1;
+            continue;
+        };
+        let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment.moments.inliers);
+        let (kept, gone) = if inliers(twin) > inliers(index) { (twin, index) } else { (index, twin) };
+        if let Some(settled) = agree([kept, gone], seen, config, pose, joint, map) {
+            *pose = settled;
         }
+        map.fuse(kept, gone);
+        let last = map.segments().len();
+        joint.removed(gone, last, map);
+        // The grown segment is looked at again, wherever it went.
+        index = if kept == last { gone } else { kept };
     }
+}
+
+/// Measures that two map segments are one line, unless they disagree. Returns the pose by that.
+fn agree<const N: usize>(
+    twins: [usize; 2],
+    seen: &Observed<'_>,
+    config: &JointConfig,
+    pose: &Isometry2<f32>,
+    joint: &mut Joint,
+    map: &mut SegmentMap<N>,
+) -> Option<Isometry2<f32>> {
+    let [kept, gone] = twins.map(|index| joint.track(index, map, seen.stamp.scan));
+    let [a, b] = twins.map(|index| map.segments().get(index).map(|s| s.segment));
+    let (a, b) = (a?, b?);
+    let length_m = a.length_m().min(b.length_m());
+    let variances = with_line_noise([0.0, 0.0], seen.line_noise, length_m);
+    let measurement = Measurement::of_twins((&a, kept?), (&b, gone?), variances);
+    (joint.chi2(&measurement) <= config.fuse_chi2).then(|| {
+        joint.measure(&measurement, 1.0, None);
+        joint.settle(pose, map)
+    })
 }
 
 /// Whether two map segments are one wall: either they agree within their uncertainty, or they lie so close behind each
 /// other that one would hide the other.
-fn one_wall(a: &MapSegment, b: &MapSegment, view: &View<'_>, config: &SumsConfig) -> bool {
+fn one_wall(
+    a: &MapSegment,
+    b: &MapSegment,
+    position: &Point2<f32>,
+    noise: &LineNoise,
+    config: &JointConfig,
+) -> bool {
     let (a, b) = (&a.segment, &b.segment);
     let facing = a.direction.dot(&b.direction) > 0.0;
     // The shorter one is judged by the longer one's line.
@@ -212,9 +309,9 @@ fn one_wall(a: &MapSegment, b: &MapSegment, view: &View<'_>, config: &SumsConfig
         return false;
     }
     let hides = overlap_m >= config.fuse_overlap * short.length_m()
-        && distance <= config.fuse_sigmas * view.line_noise.sigma_offset_m;
+        && distance <= config.fuse_sigmas * noise.sigma_offset_m;
     let agrees = || {
-        Residual::new(short, long, view.pose.translation.vector.into(), view.line_noise)
+        Residual::new(short, long, *position, noise)
             .is_some_and(|r| r.chi2(&nalgebra::Matrix3::zeros()) <= config.fuse_chi2)
     };
     // A long wall goes on behind a door; a short thing beside another is another thing.
@@ -244,9 +341,8 @@ pub fn within_reach(map: &[MapSegment], pose: &Isometry2<f32>, reach_m: f32, can
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
-    use crate::residual::LineNoise;
-    use nalgebra::{Matrix3, Point2};
+    use crate::pose::{perpendicular, pose};
+    use nalgebra::{Matrix3, Vector3};
     use std::vec::Vec as StdVec;
 
     const NOISE: LineNoise = LineNoise { sigma_offset_m: 0.005, sigma_direction_rad: 0.002 };
@@ -258,35 +354,55 @@ mod tests {
         Segment::fitted(Moments::from_points(points), &[from, to], left)
     }
 
-    fn sums() -> RegistrationConfig {
-        crate::SlamConfig::default().registration
+    fn config() -> JointConfig {
+        match crate::SlamConfig::default().registration {
+            RegistrationConfig::Joint(config) => config,
+            RegistrationConfig::EndPoints => unreachable!("the default estimates jointly"),
+        }
     }
 
+    fn observed<'a>(segments: &'a [Segment], pairs: &'a [Pair], scan: u32) -> Observed<'a> {
+        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, line_noise: &NOISE }
+    }
+
+    /// A robot that stands at the origin and is sure of it.
     fn run(
         map: &mut SegmentMap<8>,
-        observed: &[Segment],
+        joint: &mut Joint,
+        segments: &[Segment],
         pairs: &[Pair],
         scan: u32,
-        config: &RegistrationConfig,
     ) -> RegistrationReport {
-        let covariance = Matrix3::identity() * 1e-6;
-        let view = View { pose: &pose(0.0, 0.0, 0.0), covariance: &covariance, line_noise: &NOISE };
-        register(observed, pairs, &view, &Stamp { scan, way_m: 1.0 }, config, map)
+        let here = pose(0.0, 0.0, 0.0);
+        let start = Start { prior: &here, pose: &here };
+        register_jointly(&observed(segments, pairs, scan), &start, &config(), joint, map).1
+    }
+
+    fn joint() -> Joint {
+        let mut joint = Joint::new(Vector3::zeros());
+        joint.loosen_pose(&(Matrix3::identity() * 1e-6), &mut SegmentMap::<0>::new());
+        joint
     }
 
     #[test]
     fn unmatched_segments_are_added_and_matched_ones_joined() {
-        for config in [RegistrationConfig::EndPoints, sums()] {
-            let mut map = SegmentMap::new();
-            let first = run(&mut map, &[wall((0.0, 1.0), (2.0, 1.0))], &[], 1, &config);
-            assert_eq!((first.new, first.matched), (1, 0));
-            let seen = [wall((1.0, 1.0), (3.0, 1.0)), wall((3.0, 1.0), (3.0, -1.0))];
-            let second = run(&mut map, &seen, &[Pair { observed: 0, mapped: 0 }], 2, &config);
-            assert_eq!((second.new, second.matched), (1, 1));
+        let first = [wall((0.0, 1.0), (2.0, 1.0))];
+        let second = [wall((1.0, 1.0), (3.0, 1.0)), wall((3.0, 1.0), (3.0, -1.0))];
+        let pairs = [Pair { observed: 0, mapped: 0 }];
+        let check = |map: &SegmentMap<8>, reports: [RegistrationReport; 2]| {
+            assert_eq!(reports.map(|r| (r.new, r.matched)), [(1, 0), (1, 1)]);
             let joined = &map.segments()[0];
             assert_eq!((joined.hits, joined.segment.moments.inliers), (2, 80));
             assert!((joined.segment.length_m() - 3.0).abs() < 1e-4, "ends are the farthest feet");
-        }
+        };
+        let (mut map, here) = (SegmentMap::new(), pose(0.0, 0.0, 0.0));
+        let once = register_end_points(&observed(&first, &[], 1), &here, &mut map);
+        let twice = register_end_points(&observed(&second, &pairs, 2), &here, &mut map);
+        check(&map, [once, twice]);
+        let (mut map, mut joint) = (SegmentMap::new(), joint());
+        let once = run(&mut map, &mut joint, &first, &[], 1);
+        let twice = run(&mut map, &mut joint, &second, &pairs, 2);
+        check(&map, [once, twice]);
     }
 
     #[test]
@@ -304,13 +420,14 @@ mod tests {
 
     #[test]
     fn one_wall_seen_in_pieces_becomes_one_segment() {
-        let mut map = SegmentMap::new();
+        let (mut map, mut joint) = (SegmentMap::new(), joint());
         let pieces =
             [wall((0.0, 1.0), (1.0, 1.0)), wall((2.5, 1.002), (3.5, 1.0)), wall((7.0, 1.0), (8.0, 1.0))];
-        run(&mut map, &pieces, &[], 1, &sums());
+        run(&mut map, &mut joint, &pieces, &[], 1);
         assert_eq!(map.segments().len(), 3);
         // A look at the middle closes the first gap, not the second.
-        run(&mut map, &[wall((0.5, 1.0), (3.0, 1.0))], &[Pair { observed: 0, mapped: 0 }], 2, &sums());
+        let pairs = [Pair { observed: 0, mapped: 0 }];
+        run(&mut map, &mut joint, &[wall((0.5, 1.0), (3.0, 1.0))], &pairs, 2);
         let mut lengths: StdVec<f32> = map.segments().iter().map(|s| s.segment.length_m()).collect();
         lengths.sort_by(f32::total_cmp);
         assert_eq!(lengths.len(), 2);
@@ -318,40 +435,43 @@ mod tests {
         assert_eq!(map.counters().fused, 1);
     }
 
+    fn registered(walls: &[Segment]) -> SegmentMap<8> {
+        let (mut map, mut joint) = (SegmentMap::new(), joint());
+        run(&mut map, &mut joint, walls, &[], 1);
+        map
+    }
+
     #[test]
     fn a_wall_goes_on_behind_a_door_no_wider_than_it_is_long() {
-        let mut map = SegmentMap::new();
-        run(&mut map, &[wall((0.0, 1.0), (2.0, 1.0)), wall((2.9, 1.0), (5.0, 1.0))], &[], 1, &sums());
-        assert_eq!(map.segments().len(), 1);
-        let mut map = SegmentMap::new();
-        run(&mut map, &[wall((0.0, 1.0), (2.0, 1.0)), wall((2.9, 1.0), (3.2, 1.0))], &[], 1, &sums());
-        assert_eq!(map.segments().len(), 2, "a short thing behind the door is another thing");
+        let beside = |end: f32| registered(&[wall((0.0, 1.0), (2.0, 1.0)), wall((2.9, 1.0), (end, 1.0))]);
+        assert_eq!(beside(5.0).segments().len(), 1);
+        assert_eq!(beside(3.2).segments().len(), 2, "a short thing behind the door is another thing");
     }
 
     #[test]
     fn walls_that_differ_stay_apart() {
-        let mut map = SegmentMap::new();
-        let walls = [
+        let map = registered(&[
             wall((0.0, 1.0), (2.0, 1.0)),
             wall((2.0, 1.02), (0.0, 1.02)), // its other face
             wall((2.1, 1.15), (3.0, 1.15)), // the back of a recess beside it
             wall((0.0, 1.3), (2.0, 1.3)),   // behind it
             wall((2.0, 1.0), (2.0, 3.0)),   // round the corner
-        ];
-        run(&mut map, &walls, &[], 1, &sums());
+        ]);
         assert_eq!(map.segments().len(), 5);
         assert_eq!(map.counters().fused, 0);
     }
 
     #[test]
     fn a_pair_that_does_not_fit_changes_nothing() {
-        let mut map = SegmentMap::new();
-        run(&mut map, &[wall((0.0, 1.0), (2.0, 1.0))], &[], 1, &sums());
-        let before = map.segments()[0];
-        let report =
-            run(&mut map, &[wall((0.0, 1.3), (2.0, 1.3))], &[Pair { observed: 0, mapped: 0 }], 2, &sums());
+        let (mut map, mut joint) = (SegmentMap::new(), joint());
+        run(&mut map, &mut joint, &[wall((0.0, 1.0), (2.0, 1.0))], &[], 1);
+        let before = map.segments()[0].segment;
+        let pairs = [Pair { observed: 0, mapped: 0 }];
+        let report = run(&mut map, &mut joint, &[wall((0.0, 1.3), (2.0, 1.3))], &pairs, 2);
         assert_eq!((report.doubtful, report.new), (1, 0));
-        assert_eq!(map.segments(), [before]);
+        let after = map.segments()[0].segment;
+        assert_eq!((after.start, after.end, after.direction), (before.start, before.end, before.direction));
+        assert_eq!(map.segments()[0].hits, 1);
     }
 
     #[test]

@@ -203,16 +203,21 @@ impl Segment {
         }
     }
 
-    /// The segment of the points of both: their common least-squares line, from the farthest foot to the farthest.
-    /// It keeps this segment's free side.
+    /// The segment moved along its normal (m) and turned about its centroid (rad, small).
     #[must_use]
-    pub fn merged(&self, other: &Self) -> Self {
-        let moments = self.moments.merged(&other.moments);
-        let mut direction = moments.direction();
-        if direction.dot(&self.direction) < 0.0 {
-            direction = -direction;
-        }
-        Self::along(moments, direction, &[self.start, self.end, other.start, other.end])
+    pub fn shifted(&self, offset_m: f32, turn_rad: f32) -> Self {
+        let turned = self.direction + self.normal() * turn_rad;
+        let direction = turned / sqrt(turned.norm_squared());
+        let shift = self.normal() * offset_m;
+        let mut moments = self.moments;
+        moments.centroid += shift;
+        Self::along(moments, direction, &[self.start + shift, self.end + shift])
+    }
+
+    /// The segment on the same line, made longer where these points lie beyond its ends.
+    #[must_use]
+    pub fn extended(&self, points: [Point2<f32>; 2]) -> Self {
+        Self::along(self.moments, self.direction, &[self.start, self.end, points[0], points[1]])
     }
 
     fn along(moments: Moments, direction: Vector2<f32>, extremes: &[Point2<f32>]) -> Self {

@@ -1,7 +1,7 @@
 //! The only stateful wiring: a scan and a motion go in, a pose and a map come out.
 
 use heapless::Vec;
-use nalgebra::{Isometry2, Matrix3, Vector2};
+use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 use crate::association::{AssociationConfig, Pair, View, associate};
 use crate::config::{ConfigError, SlamConfig};
@@ -11,30 +11,34 @@ use crate::correction::{
 };
 use crate::deskew::{DeskewReport, ScanPoint, deskew, fill_bearings};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
+use crate::joint::Joint;
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, SegmentMap};
 use crate::math::{sqrt, wrap_angle};
-use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
 use crate::pose::{components, is_finite, pose, rotate_covariance};
-use crate::registration::{RegistrationReport, Stamp, register, within_reach};
+use crate::registration::{
+    Observed, RegistrationConfig, RegistrationReport, Stamp, Start, register_end_points, register_jointly,
+    within_reach,
+};
 use crate::scan::Scan;
 use crate::segment::Segment;
-use crate::visibility::forget_seen_through;
+use crate::visibility::{is_gone, mark_seen_through};
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///
-/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 24 for each beam and 5 KiB.
+/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 24 for each beam and 27 KiB.
 pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     config: SlamConfig,
     map: SegmentMap<N>,
     map_from_base: Isometry2<f32>,
-    covariance: Matrix3<f32>,
+    /// Of the pose among the lines around it; what they have in common with it is the joint estimate's.
+    local_covariance: Matrix3<f32>,
     counters: Counters,
     way_m: f32,
     closing: PendingClosure,
-    bias: Option<OdometryBias>,
+    joint: Option<Joint>,
     bearings: Vec<Vector2<f32>, BEAMS>,
     points: Vec<ScanPoint, BEAMS>,
     observed: Vec<Segment, MAX_SEGMENTS>,
@@ -130,11 +134,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             config,
             map: SegmentMap::new(),
             map_from_base: Isometry2::identity(),
-            covariance: Matrix3::zeros(),
+            local_covariance: Matrix3::zeros(),
             counters: Counters::default(),
             way_m: 0.0,
             closing: PendingClosure::default(),
-            bias: config.odometry.bias.map(OdometryBias::new),
+            joint: matches!(config.registration, RegistrationConfig::Joint(_))
+                .then(|| Joint::new(config.odometry.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas()))),
             bearings: Vec::new(),
             points: Vec::new(),
             observed: Vec::new(),
@@ -162,12 +167,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// Covariance of the pose (x, y, θ), in `map`.
     pub fn covariance(&self) -> Matrix3<f32> {
-        self.covariance
+        self.joint.as_ref().map_or(self.local_covariance, Joint::pose_covariance)
     }
 
-    /// Systematic errors of the odometry as learnt so far: see [`OdometryBias::estimate`]. `None` where it does not learn.
-    pub fn odometry_bias(&self) -> Option<[f32; 3]> {
-        self.bias.as_ref().map(OdometryBias::estimate)
+    /// Systematic errors of the odometry as learnt so far.
+    pub fn odometry_bias(&self) -> OdometryBias {
+        self.joint.as_ref().map_or_else(OdometryBias::default, Joint::bias)
     }
 
     /// Counters since the start.
@@ -215,56 +220,45 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             if let Some(config) = self.config.loop_closure {
                 self.close_loop(&config, &mut update);
             }
-            self.learn_bias(&prior, motion, &update);
-            self.extend_map(&mut update);
+            self.extend_map(&prior, &mut update);
             self.forget(scan, &update);
         }
         self.count(&update);
         update.counters = self.counters;
         update.map_counters = self.map.counters();
         self.map_from_base = update.pose;
-        self.covariance = update.covariance;
+        self.local_covariance = update.covariance;
+        update.covariance = self.covariance();
         update
     }
 
     /// Eq. (1) with covariance: where the odometry says the base is.
     fn predict(&mut self, motion: &ScanMotion) -> Prior {
-        let prior = self.prior_after(&self.unbiased(&motion.since_previous));
-        let covariance_is_finite = prior.covariance.iter().all(|v| v.is_finite());
-        if !(motion.is_finite() && is_finite(&prior.pose) && covariance_is_finite) {
-            self.counters.bad_motion = self.counters.bad_motion.saturating_add(1);
-            return Prior { pose: self.map_from_base, covariance: Matrix3::identity() };
-        }
-        self.way_m += motion.since_previous.distance_m;
-        prior
-    }
-
-    /// The increment without the systematic errors learnt so far.
-    fn unbiased(&self, increment: &Increment) -> Increment {
-        self.bias.as_ref().map_or(*increment, |bias| bias.corrected(increment))
-    }
-
-    /// Learns the odometry's systematic errors from a correction that left no direction open.
-    fn learn_bias(&mut self, prior: &Prior, motion: &ScanMotion, update: &SlamUpdate) {
-        let plain =
-            update.corrected && update.closure.is_none() && update.observability.verdict == Verdict::Full;
-        let Some(bias) = self.bias.as_mut().filter(|_| plain && motion.is_finite()) else { return };
-        let moved = crate::pose::log(&prior.pose.inv_mul(&update.pose));
-        let covariance = rotate_covariance(&prior.pose.inverse(), &prior.covariance);
-        bias.learn(&motion.since_previous, &moved, &covariance);
-    }
-
-    fn prior_after(&self, increment: &Increment) -> Prior {
+        let increment = self.odometry_bias().corrected(&motion.since_previous);
         let c = components(&(self.map_from_base * increment.before_from_after));
         let moved = increment.before_from_after.translation.vector;
         // Derivative of the new pose by the old heading.
         let lever = crate::pose::perpendicular(self.map_from_base.rotation * moved);
-        let mut jacobian = Matrix3::identity();
-        (jacobian.m13, jacobian.m23) = (lever.x, lever.y);
-        let grown = self.config.odometry.noise.covariance(increment);
-        let covariance = jacobian * self.covariance * jacobian.transpose()
-            + rotate_covariance(&self.map_from_base, &grown);
-        Prior { pose: pose(c.x, c.y, c.z), covariance }
+        let mut by_pose = Matrix3::identity();
+        (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
+        let grown = self.config.odometry.noise.covariance(&increment);
+        let noise = rotate_covariance(&self.map_from_base, &grown);
+        let covariance = by_pose * self.local_covariance * by_pose.transpose() + noise;
+        let prior = Prior { pose: pose(c.x, c.y, c.z), covariance };
+        if !(motion.is_finite() && is_finite(&prior.pose) && covariance.iter().all(|v| v.is_finite())) {
+            self.counters.bad_motion = self.counters.bad_motion.saturating_add(1);
+            if let Some(joint) = &mut self.joint {
+                joint.loosen_pose(&Matrix3::identity(), &mut self.map);
+            }
+            return Prior { pose: self.map_from_base, covariance: Matrix3::identity() };
+        }
+        if let Some(joint) = &mut self.joint {
+            let turn = self.map_from_base.rotation.to_rotation_matrix().to_homogeneous();
+            let by_odometry = turn * OdometryBias::derivative(&motion.since_previous);
+            joint.predict(&by_pose, &by_odometry, &noise, &mut self.map);
+        }
+        self.way_m += motion.since_previous.distance_m;
+        prior
     }
 
     fn rejection(&self, scan: &Scan<'_>) -> Option<ScanRejection> {
@@ -358,6 +352,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
         if let Some(winner) = winner {
             *best = winner;
+            if let Some(joint) = &mut self.joint {
+                joint.loosen_pose(&(broad.covariance - prior.covariance), &mut self.map);
+            }
         }
         self.associate(best);
     }
@@ -380,9 +377,13 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let seen =
             hypothesis.observability.verdict == Verdict::Full && hypothesis.support >= config.min_support;
         let drifted = chi2_between(&hypothesis.pose, &update.pose, &update.covariance) >= config.min_chi2;
+        // The pose knows how far it may have drifted.
+        let likely = self.joint.as_ref().is_none_or(|j| {
+            chi2_between(&hypothesis.pose, &update.pose, &j.pose_covariance()) <= config.max_chi2
+        });
         let began = self.pairs.iter().filter_map(|p| self.map.segments().get(p.mapped)).map(|s| s.seen_at_m);
         let loop_began_m = began.fold(0.0, f32::max);
-        if seen && drifted {
+        if seen && drifted && likely {
             let closure = Closure { drifted: update.pose, closed: hypothesis.pose, loop_began_m, way_m };
             if self.closing.confirmed_by(&closure, config) {
                 self.map.iter_mut().for_each(|entry| closure.bend_segment(entry));
@@ -434,14 +435,31 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
     }
 
-    fn extend_map(&mut self, update: &mut SlamUpdate) {
-        let config = &self.config;
-        let view =
-            View { pose: &update.pose, covariance: &update.covariance, line_noise: &config.line_noise };
+    /// From pairs to map, and with it, in the joint estimate, to the pose.
+    fn extend_map(&mut self, prior: &Prior, update: &mut SlamUpdate) {
         update.residual_m = self.residual_m(&update.pose);
-        let stamp = Stamp { scan: self.counters.scans, way_m: self.way_m };
-        let (observed, pairs) = (&self.observed, &self.pairs);
-        update.registration = register(observed, pairs, &view, &stamp, &config.registration, &mut self.map);
+        let seen = Observed {
+            segments: &self.observed,
+            pairs: &self.pairs,
+            stamp: Stamp { scan: self.counters.scans, way_m: self.way_m },
+            line_noise: &self.config.line_noise,
+        };
+        let (RegistrationConfig::Joint(config), Some(joint)) = (&self.config.registration, &mut self.joint)
+        else {
+            update.registration = register_end_points(&seen, &update.pose, &mut self.map);
+            return;
+        };
+        // A closed loop has moved the prediction with the map.
+        let carried = update.closure.map(|closure| closure.closed * closure.drifted.inverse());
+        let start = Start {
+            prior: &carried.map_or(prior.pose, |closed_from_drifted| closed_from_drifted * prior.pose),
+            pose: &update.pose,
+        };
+        let (pose, report) = register_jointly(&seen, &start, config, joint, &mut self.map);
+        update.registration = report;
+        if is_finite(&pose) {
+            update.pose = pose;
+        }
     }
 
     /// Forgets what the scan has seen through.
@@ -450,15 +468,14 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         // Fusing may have moved segments: what is within reach is found anew.
         self.find_candidates(&update.pose);
         let (sensor, scan_number) = (&self.config.sensor, self.counters.scans);
-        forget_seen_through(
-            scan,
-            &update.pose,
-            scan_number,
-            sensor,
-            &config,
-            &self.candidates,
-            &mut self.map,
-        );
+        let candidates = &self.candidates;
+        mark_seen_through(scan, &update.pose, scan_number, sensor, &config, candidates, &mut self.map);
+        while let Some(index) = self.map.segments().iter().position(|s| is_gone(s, &config)) {
+            self.map.forget(index);
+            if let Some(joint) = &mut self.joint {
+                joint.removed(index, self.map.segments().len(), &mut self.map);
+            }
+        }
     }
 
     fn residual_m(&self, pose: &Isometry2<f32>) -> f32 {

@@ -3,6 +3,7 @@
 use nalgebra::{Isometry2, Vector2};
 use slam_core::SlamConfig;
 
+use super::Figure;
 use crate::log::Log;
 use crate::output::svg::{self, Scene};
 use crate::replay::{self, Replay, ReplayError, Step};
@@ -12,7 +13,7 @@ use crate::sim::world::World;
 use crate::sim::{self, SimConfig, judge};
 
 /// The map of a simulated drive over its blueprint, with the true path; for the hall also as dead reckoning has it.
-pub fn simulated(world: &World, seed: u64) -> Result<Vec<(String, String)>, ReplayError> {
+pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
     let robot = Robot::usual_for("simulated");
     let drive = sim::drive(world, &robot, &SimConfig::default(), seed)?;
     let replay = replay::run(&drive.log, &robot, SlamConfig::default(), || {})?;
@@ -32,7 +33,7 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<(String, String)>, Repl
 }
 
 /// The map of a recorded log, with the reference trajectory laid on it.
-pub fn recorded(name: &str, log: &Log, replay: &Replay, reference: &[StampedPosition]) -> (String, String) {
+pub fn recorded(name: &str, log: &Log, replay: &Replay, reference: &[StampedPosition]) -> Figure {
     let positions = super::stamped(replay::trajectory(&replay.steps));
     let reference: Vec<Isometry2<f32>> = score::align(reference, &positions)
         .map(|alignment| {

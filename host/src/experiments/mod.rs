@@ -122,6 +122,9 @@ pub struct Recorded {
     pub relations_m: Option<f64>,
 }
 
+/// File name and content of a figure.
+pub type Figure = (String, String);
+
 /// Everything measured, and the figures.
 #[derive(Debug)]
 pub struct Results {
@@ -131,8 +134,8 @@ pub struct Results {
     pub runs: Vec<Run>,
     /// Every recorded log that was at hand.
     pub recorded: Vec<Recorded>,
-    /// File name and content of each figure.
-    pub figures: Vec<(String, String)>,
+    /// The figures.
+    pub figures: Vec<Figure>,
 }
 
 /// What the experiments are run on.
@@ -244,7 +247,7 @@ fn recorded(
     data: &Path,
     name: &'static str,
     file: &str,
-) -> Result<Option<(Recorded, (String, String))>, ExperimentError> {
+) -> Result<Option<(Recorded, Figure)>, ExperimentError> {
     let path = data.join(file);
     if !path.exists() {
         return Ok(None);

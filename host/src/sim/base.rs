@@ -27,6 +27,8 @@ pub struct Base {
     waypoints: Vec<Point2<f64>>,
     speed: f64,
     next: usize,
+    /// Time to stand before driving, seconds.
+    pause_s: f64,
     /// Pose of `base` in the world.
     pub pose: Isometry2<f64>,
     /// Forward speed, m/s, and turn, rad/s.
@@ -58,6 +60,7 @@ impl Base {
             waypoints,
             speed: path.speed,
             next: 1,
+            pause_s: path.pause_s,
             twist: [0.0; 2],
             angle: [0.0; 2],
         }
@@ -75,6 +78,10 @@ impl Base {
 
     /// Drives on for a short while.
     pub fn step(&mut self, dt_s: f64) {
+        if self.pause_s > 0.0 {
+            self.pause_s -= dt_s;
+            return;
+        }
         let [speed, turn] = self.wanted();
         let towards =
             |now: f64, wanted: f64, most: f64| now + (wanted - now).clamp(-most * dt_s, most * dt_s);

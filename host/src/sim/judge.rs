@@ -14,6 +14,10 @@ const WALL_DISTANCE_M: f64 = 0.35;
 const WALL_SINE: f64 = 0.17;
 /// … and ends this close to the corner or beyond it, metres.
 const WALL_REACH_M: f64 = 1.0;
+/// Where a wall's side is looked at: this far along the wall from its corner and this far off it, metres.
+const SIDE_PROBE_M: [f64; 2] = [0.2, 0.02];
+/// Every so-manieth pose is asked what it saw.
+const SIGHTING_STEP: usize = 5;
 /// A segment farther than this from everything that stands still is spurious, metres.
 const SPURIOUS_M: f64 = 0.15;
 /// Map segments seen in fewer scans are not yet part of the map that is judged.
@@ -113,7 +117,7 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
     let last = off.len().saturating_sub(1);
     let map = map_in_world(drive, &replay.map);
     let found: Vec<f64> =
-        world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), &map)).collect();
+        world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), drive, &map)).collect();
     let (edges, discs) = (world.edges(), world.discs());
     let established: Vec<&Segment> =
         map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
@@ -181,10 +185,11 @@ fn covariance_in_base(drive: &Drive, step: &Step, truth: &Isometry2<f64>) -> Mat
 }
 
 /// Distance between a corner of the blueprint and the crossing of the map's lines for the two walls that meet there.
-fn corner_error(world: &World, corner: Point2<f64>, map: &[MapSegment]) -> Option<f64> {
+fn corner_error(world: &World, corner: Point2<f64>, drive: &Drive, map: &[MapSegment]) -> Option<f64> {
     let walls = world.directions_at(corner);
-    let a = line_for(corner, walls.first()?, map)?;
-    let b = line_for(corner, walls.get(1)?, map)?;
+    let edges = world.edges();
+    let line = |wall: &Vector2<f64>| line_for(corner, wall, seen_side(corner, wall, &edges, drive)?, map);
+    let (a, b) = (line(walls.first()?)?, line(walls.get(1)?)?);
     // n·p = d for both.
     let denominator = a.0.perp(&b.0);
     (denominator.abs() > 0.3).then(|| {
@@ -194,8 +199,37 @@ fn corner_error(world: &World, corner: Point2<f64>, map: &[MapSegment]) -> Optio
     })
 }
 
-/// Normal and distance of the best-supported map line for a wall that leaves a corner in a direction.
-fn line_for(corner: Point2<f64>, wall: &Vector2<f64>, map: &[MapSegment]) -> Option<(Vector2<f64>, f64)> {
+/// Unit normal, on the side from which the robot saw it most, of the wall that leaves a corner in a direction. The two faces
+/// of a thin wall are two lines. `None` where it was never seen.
+fn seen_side(
+    corner: Point2<f64>,
+    wall: &Vector2<f64>,
+    edges: &[Edge],
+    drive: &Drive,
+) -> Option<Vector2<f64>> {
+    let normal = Vector2::new(-wall.y, wall.x);
+    let sightings = |normal: Vector2<f64>| {
+        let probe = corner + wall * SIDE_PROBE_M[0] + normal * SIDE_PROBE_M[1];
+        let sees = |pose: &&Isometry2<f64>| {
+            let to_probe = probe - Point2::from(pose.translation.vector);
+            let distance_m = to_probe.norm();
+            distance_m < super::scanner::REACH_M
+                && super::scanner::cast(pose.translation.vector.into(), to_probe / distance_m, edges, &[])
+                    .is_none_or(|hit| hit.range_m > distance_m)
+        };
+        drive.truth.iter().step_by(SIGHTING_STEP).filter(sees).count()
+    };
+    let (left, right) = (sightings(normal), sightings(-normal));
+    (left + right > 0).then(|| if left >= right { normal } else { -normal })
+}
+
+/// Normal and distance of the best-supported map line for a wall that leaves a corner in a direction, seen from a side.
+fn line_for(
+    corner: Point2<f64>,
+    wall: &Vector2<f64>,
+    side: Vector2<f64>,
+    map: &[MapSegment],
+) -> Option<(Vector2<f64>, f64)> {
     let fits = |entry: &&MapSegment| {
         let segment = &entry.segment;
         let direction: Vector2<f64> = nalgebra::convert(segment.direction);
@@ -203,6 +237,7 @@ fn line_for(corner: Point2<f64>, wall: &Vector2<f64>, map: &[MapSegment]) -> Opt
         let ways = ends.map(|end| (end - corner).dot(wall));
         let off = (ends[0] - corner).perp(&direction).abs();
         direction.perp(wall).abs() < WALL_SINE
+            && nalgebra::convert::<_, Vector2<f64>>(segment.normal()).dot(&side) > 0.0
             && off < WALL_DISTANCE_M
             && ways[0].min(ways[1]) < WALL_REACH_M
             && ways[0].max(ways[1]) > 0.1

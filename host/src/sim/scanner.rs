@@ -10,7 +10,7 @@ use super::SensorModel;
 use super::world::{Disc, Edge, World};
 
 /// Farthest distance the sensor reports, metres.
-const REACH_M: f64 = 5.6;
+pub const REACH_M: f64 = 5.6;
 /// Codes of the sensor for readings that went wrong: weak return, neighbours in error, two waves differ, not measurable.
 const ERROR_CODES: [u16; 4] = [1, 7, 8, 19];
 /// Neighbouring ranges farther apart than this have an edge between them, metres.
@@ -25,11 +25,14 @@ pub struct Scanner {
     rng: Pcg64,
 }
 
-struct Hit {
-    range_m: f64,
+/// What a ray met.
+pub struct Hit {
+    /// Distance, metres.
+    pub range_m: f64,
     /// Cosine of the angle between beam and surface normal.
-    incidence: f64,
-    glass: bool,
+    pub incidence: f64,
+    /// Whether it gives no echo.
+    pub glass: bool,
 }
 
 impl Scanner {
@@ -97,7 +100,7 @@ pub fn distance_to(edge: &Edge, point: Point2<f64>) -> f64 {
 }
 
 /// The first surface a ray meets.
-fn cast(from: Point2<f64>, direction: Vector2<f64>, edges: &[Edge], discs: &[Disc]) -> Option<Hit> {
+pub fn cast(from: Point2<f64>, direction: Vector2<f64>, edges: &[Edge], discs: &[Disc]) -> Option<Hit> {
     let mut best: Option<Hit> = None;
     let mut offer = |range_m: f64, incidence: f64, glass: bool| {
         if range_m > 1e-3 && best.as_ref().is_none_or(|b| range_m < b.range_m) {

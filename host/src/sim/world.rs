@@ -5,7 +5,7 @@ use std::path::Path;
 use nalgebra::{Point2, Vector2};
 use serde::Deserialize;
 
-use crate::toml_file::{self, Checked, FileError, Impossible, positive};
+use crate::toml_file::{self, Checked, FileError, Impossible, not_negative, positive};
 
 /// A world, as its file describes it. Metres and degrees, in the frame of the blueprint.
 #[derive(Clone, Debug, Deserialize)]
@@ -120,8 +120,15 @@ pub struct DrivenPath {
     pub heading_deg: f64,
     /// Speed where a way point states none, m/s.
     pub speed: f64,
+    /// Time the robot stands before it drives, as robots do while they wake up, seconds. 2 where the file says nothing.
+    #[serde(default = "usual_pause_s")]
+    pub pause_s: f64,
     /// Way points, the first of which is the start.
     pub points: Vec<[f64; 2]>,
+}
+
+fn usual_pause_s() -> f64 {
+    2.0
 }
 
 /// A straight piece of a surface.
@@ -179,6 +186,7 @@ impl Checked for World {
         }
         finite("path.points", &self.path.points)?;
         positive("path.speed", self.path.speed)?;
+        not_negative("path.pause_s", self.path.pause_s)?;
         if self.path.points.len() < 2 {
             return Err(("path.points".into(), "has fewer than two way points".into()));
         }

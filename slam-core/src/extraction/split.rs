@@ -24,6 +24,10 @@ const STACK: usize = 32;
 const FAR_SHARE: f32 = 0.8;
 /// Readings this many standard deviations within the sensor's range are not lost.
 const LOST_SIGMAS: f32 = 4.0;
+/// Parts of a piece between which a cut is looked for first.
+const PARTS: usize = 8;
+/// Fewest points on either side of such a cut.
+const LEAST_PART: usize = 3;
 /// A line goes on behind this many points off it.
 const MOST_STRAYS: usize = 2;
 
@@ -105,7 +109,8 @@ fn split_cluster(cluster: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConf
     while let Some((from, to)) = next.or_else(|| stack.pop()) {
         next = None;
         let Some(points) = cluster.get(from..to) else { break };
-        if let Some(cut) = farthest_from_chord(points, view, config.split_sigmas)
+        if let Some(cut) =
+            farthest_from_chord(points, view, config.split_sigmas).or_else(|| two_lines(points, view, config))
             && stack.push((from + cut, to)).is_ok()
         {
             next = Some((from, from + cut));
@@ -159,6 +164,30 @@ fn farthest_from_chord(points: &[ScanPoint], view: &Viewpoint<'_>, sigmas: f32) 
     cut
 }
 
+/// Index at which to cut a piece that two lines fit better than one: a step in a wall, too low for any single point to
+/// show it.
+fn two_lines(points: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConfig) -> Option<usize> {
+    let coarse = (points.len() / PARTS).max(1);
+    let normal = chord_normal(points)?;
+    let sums = |part: &[ScanPoint]| {
+        Moments::from_points(part.iter().map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
+    };
+    let all = sums(points);
+    // χ² saved by two lines over what two lines of chance would save; positive where a cut is due.
+    let saved = |cut: usize| {
+        let (a, b) = points.split_at_checked(cut).filter(|(a, b)| a.len().min(b.len()) >= LEAST_PART)?;
+        let (a, b) = (sums(a), sums(b));
+        let cost = all.residual() - a.residual() - b.residual();
+        let due = cost - joining_limit(&a, &b, config);
+        (due > 0.0).then_some((cut, cost))
+    };
+    let best = |cuts: &mut dyn Iterator<Item = usize>| {
+        cuts.filter_map(saved).max_by(|a, b| a.1.total_cmp(&b.1)).map(|(cut, _)| cut)
+    };
+    let near = best(&mut (coarse..points.len()).step_by(coarse))?;
+    best(&mut (near.saturating_sub(coarse) + 1..near + coarse))
+}
+
 /// Unit normal of the line through the first and last point; `None` where they coincide.
 fn chord_normal(points: &[ScanPoint]) -> Option<Vector2<f32>> {
     let chord = perpendicular(points.last()?.position - points.first()?.position);
@@ -176,8 +205,13 @@ fn chord_moments(points: &[ScanPoint], view: &Viewpoint<'_>) -> Moments {
 /// Whether two neighbouring pieces are one line: their common fit must not be worse than their own.
 fn is_one_line(a: &Moments, b: &Moments, config: &SplitConfig) -> bool {
     let cost = a.merged(b).residual() - a.residual() - b.residual();
+    cost <= joining_limit(a, b, config)
+}
+
+/// χ² that joining two pieces of one line may cost.
+fn joining_limit(a: &Moments, b: &Moments, config: &SplitConfig) -> f32 {
     // 9: the 99 % point of χ² with the two degrees of freedom that a second line has.
-    cost <= (config.merge_chi2 * a.inliers.min(b.inliers) as f32).max(9.0)
+    (config.merge_chi2 * a.inliers.min(b.inliers) as f32).max(9.0)
 }
 
 /// Sums over the points of a line that is nearly known, free of two biases of a plain fit.
