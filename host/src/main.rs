@@ -9,6 +9,7 @@ use anyhow::Context;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use comfy_table::{CellAlignment, Table, presets};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use lineslam::calibrate::{self, CalibrationError};
 use lineslam::experiments::{self, ExperimentError, document};
 use lineslam::log::{self, Format, Log, ReadOptions};
 use lineslam::output::report::{Report, SimulationReport};
@@ -35,6 +36,8 @@ enum Command {
     Replay(ReplayArgs),
     /// Drive a simulated robot through a world and see how well it maps it.
     Simulate(SimulateArgs),
+    /// Learn wheel radii, track, delay and mounting from a drive, and write a robot file.
+    Calibrate(CalibrateArgs),
     /// Run the paper's experiments and more, and write the page with tables and figures.
     Experiments(ExperimentsArgs),
 }
@@ -84,6 +87,24 @@ struct SimulateArgs {
 }
 
 #[derive(Args)]
+struct CalibrateArgs {
+    /// The log, plain or gzipped, with wheel ticks.
+    log: PathBuf,
+    /// Robot file that describes the robot nearly.
+    #[arg(long, value_name = "FILE")]
+    robot: PathBuf,
+    /// Format of the log.
+    #[arg(long, value_enum, default_value_t = Format::Auto)]
+    format: Format,
+    /// The robot file to write: the one given, with what the log told.
+    #[arg(long, value_name = "FILE", default_value = "calibrated.toml")]
+    out: PathBuf,
+    /// Skip and count records that cannot be read, instead of stopping at the first.
+    #[arg(long)]
+    lenient: bool,
+}
+
+#[derive(Args)]
 struct ExperimentsArgs {
     /// Drives of each building.
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
@@ -116,6 +137,14 @@ impl Configuration {
         }
     }
 
+    /// For pictures.
+    fn subtitle(self) -> &'static str {
+        match self {
+            Self::Default => "default configuration",
+            Self::Paper => "paper configuration",
+        }
+    }
+
     fn config(self) -> SlamConfig {
         match self {
             Self::Default => SlamConfig::default(),
@@ -128,6 +157,7 @@ fn main() -> ExitCode {
     let done = match Cli::parse().command {
         Command::Replay(args) => replay(&args),
         Command::Simulate(args) => simulate(&args),
+        Command::Calibrate(args) => run_calibrate(&args),
         Command::Experiments(args) => run_experiments(&args),
     };
     match done {
@@ -138,6 +168,7 @@ fn main() -> ExitCode {
                 || error.is::<FileError>()
                 || error.is::<ReplayError>()
                 || error.is::<BadSetting>()
+                || error.is::<CalibrationError>()
                 || error.is::<ExperimentError>();
             ExitCode::from(if bad_input { 2 } else { 1 })
         }
@@ -153,7 +184,7 @@ fn replay(args: &ReplayArgs) -> anyhow::Result<()> {
     let result = run(&log, &robot, args.config)?;
     let report = Report::new(&log, &robot, args.config.name(), &result);
     let name = args.log.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-    let scene = Scene { title: &name, configuration: args.config.name(), ..Scene::default() };
+    let scene = Scene { title: &name, subtitle: args.config.subtitle(), ..Scene::default() };
     let files = results(&result, &report, &scene)?;
     output::write_all(&args.out, &files)?;
     print_summary("log", &args.log.display().to_string(), &args.out, &report);
@@ -175,7 +206,7 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let blueprint = judge::blueprint_in_map(&world, &drive);
     let scene = Scene {
         title: &caption,
-        configuration: args.config.name(),
+        subtitle: args.config.subtitle(),
         blueprint: &blueprint,
         ..Scene::default()
     };
@@ -185,6 +216,32 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     files.push(("truth.tum", tum::render_f64(stamps.zip(&drive.truth)).into_bytes()));
     output::write_all(&args.out, &files)?;
     print_summary("world", &caption, &args.out, &report);
+    Ok(())
+}
+
+fn run_calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
+    // Checked first: its beams are what the log must have.
+    let robot = Robot::load(&args.robot)?;
+    let options = ReadOptions { format: args.format, beams: robot.beams(), lenient: args.lenient };
+    let log = log::read(&args.log, &options)?;
+    let progress = progress_bar(calibrate::ROUNDS, "replays at most");
+    let result = calibrate::calibrate(&log, &args.robot, || progress.inc(1))?;
+    progress.finish_and_clear();
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.set_header(["", "file", "log", "± 1σ", ""]);
+    for p in &result.parameters {
+        let told = if p.told { "" } else { "the log cannot tell: the file's value stays" };
+        let digits = |v: f64| format!("{v:.4}");
+        table.add_row([p.key.join("."), digits(p.before), digits(p.value), digits(p.sigma), told.into()]);
+    }
+    for column in table.column_iter_mut().skip(1).take(3) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let (folder, name) = (args.out.parent().unwrap_or(Path::new("")), args.out.file_name());
+    let name = name.context("--out is not a file name")?;
+    output::write_all(folder, &[(name, result.robot_file.into_bytes())])?;
+    println!("{table}\n\nby {} windows; written to {}", result.windows, args.out.display());
     Ok(())
 }
 

@@ -57,6 +57,20 @@ pub struct NoiseFile {
     heading_floor_deg: f32,
 }
 
+impl NoiseFile {
+    /// All that grows with the way, so many times as large.
+    #[must_use]
+    pub fn times(&self, factor: f32) -> Self {
+        Self {
+            along_m_per_sqrt_m: factor * self.along_m_per_sqrt_m,
+            across_m_per_sqrt_m: factor * self.across_m_per_sqrt_m,
+            heading_deg_per_sqrt_m: factor * self.heading_deg_per_sqrt_m,
+            heading_deg_per_sqrt_turn_deg: factor * self.heading_deg_per_sqrt_turn_deg,
+            ..*self
+        }
+    }
+}
+
 /// `[sensor]`
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -63,6 +63,10 @@ pub struct SearchConfig {
     pub reach_rad: f32,
 }
 
+/// The paper's system is called singular when its least eigenvalue is this share of its largest, or less (ours). Walls that are
+/// parallel but for the noise of their directions would otherwise fix the position along them.
+const SINGULAR_SHARE: f32 = 1e-3;
+
 /// Which directions of the pose the pairs fix.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observability {
@@ -156,9 +160,9 @@ pub fn least_squares(
             right += row * (n * gap); // E, F
         }
     }
-    // Eq. (9). A system is called singular where f32 could not solve it to a digit.
+    // Eq. (9). The paper does not say when it calls a system singular.
     let [least, _, most] = sorted_eigenvalues(&normal_matrix);
-    if least.is_nan() || least <= 1e-5 * most {
+    if least.is_nan() || least <= SINGULAR_SHARE * most {
         return None;
     }
     let inverse = normal_matrix.cholesky()?.inverse();
@@ -478,10 +482,7 @@ mod tests {
         let mut gauss = || (0..12).map(|_| rng.next_u32() as f32 / u32::MAX as f32).sum::<f32>() - 6.0;
         let noise = LineNoise { sigma_offset_m: 0.0, sigma_direction_rad: 0.0 };
         let map = entries(
-            &room()
-                .iter()
-                .map(|s| Segment { moments: s.moments.loosened(1e4, 1e4), ..*s })
-                .collect::<Vec<_>>(),
+            &room().iter().map(|s| crate::joint::with_variances(s, 1e-12, 1e-12)).collect::<Vec<_>>(),
         );
         let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() };
         let config = MapConfig { kernel_chi2: 1e9, direction_trust_rad: 0.0, ..config() };

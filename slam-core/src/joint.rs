@@ -5,6 +5,10 @@
 //! have in common: an extended Kalman filter over the pose (x, y, θ), three errors of the odometry, and offset and
 //! direction of up to [`LINES`] map segments, those seen last. A segment that gives up its place keeps its own variances.
 //!
+//! Errors are those about the present estimate, and are carried over when it moves: turned about the map's origin, a robot
+//! that has been moved turns about elsewhere, and a line that has been turned is shifted along another normal. Without that
+//! a filter comes to know, by turning its own estimate back and forth, what no measurement told it: where all of the map lies.
+//!
 //! Offsets are along a line's normal at its centroid, which wanders along the line to where the offset is independent of
 //! the direction: the centroid of all points that were seen on it, as it were.
 

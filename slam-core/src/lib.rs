@@ -7,11 +7,14 @@
 //!
 //! ```text
 //!  ranges_mm ──► deskew ──► extraction ──► association ◄──┐ ──► registration ──► map
-//!                  ▲        [Segment]       [Pair] │      │          ▲            │
-//!  ticks ──► odometry ──► predicted pose ──────────▼──► correction ──┤      forgetting
-//!            [OdometryTrack]  ▲              heading search │        │            │
-//!                             └───── odometry bias ◄────────┘ loop closure ◄──────┘
+//!                  ▲        [Segment]       [Pair] │      │       [Joint]         │
+//!  ticks ──► odometry ──► predicted pose ──────────▼──► correction   │ ▲    forgetting
+//!            [OdometryTrack]  ▲              heading search          │ │          │
+//!                             └───── pose, odometry's errors ◄───────┘ loop closure
 //! ```
+//!
+//! The correction finds which segment is which, and a pose good enough to make everything linear. The joint estimate
+//! then has the last word on the pose, on the odometry's errors and on the lines.
 //!
 //! [`Slam::process_scan`](slam::Slam::process_scan) is that drawing; each stage is a module of its own and can be used
 //! without it.

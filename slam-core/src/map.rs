@@ -11,7 +11,8 @@ use crate::segment::Segment;
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MapSegment {
-    /// The segment in `map`.
+    /// The segment in `map`. Its weight and scatter say how sure its line is; while it is tracked with the pose, how sure it
+    /// would be if the pose were known.
     pub segment: Segment,
     /// Number of scans that saw it; stays at its maximum.
     pub hits: u16,

@@ -3,9 +3,8 @@
 //! In: observed segments in `base`, the corrected pose, the pairs. Out: a changed map. Unmatched segments are added,
 //! matched ones joined with their pair.
 //!
-//! The paper (equation (10), Fig. 6) joins by the line through the four end points. The default adds up the sums behind
-//! both segments, so that the map's line is the least-squares line of all points ever seen on it, and fuses map
-//! segments that turn out to be one wall.
+//! The paper (equation (10), Fig. 6) joins by the line through the four end points. The default hands the pairs to the
+//! [`Joint`] estimate, which moves pose and lines together, and fuses map segments that turn out to be one wall.
 
 use heapless::{Vec, VecView};
 use nalgebra::{Isometry2, Point2};
@@ -39,6 +38,10 @@ pub struct JointConfig {
     pub max_chi2: f32,
     /// A pair that fits worse than this χ² counts for less: its variance grows with its χ².
     pub kernel_chi2: f32,
+    /// Scans from nearly the same place share errors (corners cut alike, edges mixed alike): variances count so many times …
+    pub shared_factor: f32,
+    /// … until the robot has moved about this far between two scans, metres; a radian counts as a metre.
+    pub shared_way_m: f32,
     /// A segment seen in fewer scans than this is young. A young one that is seen only now and then may be walking, or nothing:
     /// the pose learns nothing from it.
     pub young_hits: u16,
@@ -91,6 +94,8 @@ pub struct Observed<'a> {
     pub pairs: &'a [Pair],
     /// When they were seen.
     pub stamp: Stamp,
+    /// Way since the scan before, metres; a radian counts as a metre.
+    pub moved_m: f32,
     /// Errors of lines beyond their points' noise.
     pub line_noise: &'a LineNoise,
 }
@@ -163,6 +168,8 @@ pub fn register_jointly<const N: usize>(
     map: &mut SegmentMap<N>,
 ) -> (Isometry2<f32>, RegistrationReport) {
     let mut report = RegistrationReport::default();
+    let ways = seen.moved_m / config.shared_way_m;
+    let shared = 1.0 + (config.shared_factor - 1.0) / (1.0 + ways * ways * ways * ways);
     let mut matched: Vec<Pair, MAX_SEGMENTS> = Vec::new();
     let position = start.prior.translation.vector;
     let mut since_prior = components(start.pose) - components(start.prior);
@@ -187,7 +194,8 @@ pub fn register_jointly<const N: usize>(
         let doubted = entry.hits < config.young_hits
             && joint.age_scans(place) > config.young_scans_per_hit * f32::from(entry.hits);
         let only = doubted.then_some(place);
-        joint.measure(&measurement, (chi2 / config.kernel_chi2).max(1.0), only);
+        let factor = shared * (chi2 / config.kernel_chi2).max(1.0);
+        joint.measure(&measurement, factor, only);
         mark_seen(entry, &seen.stamp);
         report.matched += 1;
         // As many pairs as observed segments at most.
@@ -362,7 +370,7 @@ mod tests {
     }
 
     fn observed<'a>(segments: &'a [Segment], pairs: &'a [Pair], scan: u32) -> Observed<'a> {
-        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, line_noise: &NOISE }
+        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, moved_m: 0.0, line_noise: &NOISE }
     }
 
     /// A robot that stands at the origin and is sure of it.

@@ -76,16 +76,6 @@ impl Moments {
         }
     }
 
-    /// The same line, less sure: information about its offset and about its direction are multiplied by these shares.
-    #[must_use]
-    pub fn loosened(&self, offset_share: f32, direction_share: f32) -> Self {
-        Self {
-            weight: self.weight * offset_share,
-            scatter: self.scatter.map(|s| s * direction_share),
-            ..*self
-        }
-    }
-
     /// The sums of the points carried to another frame.
     #[must_use]
     pub fn transformed(&self, to_from_here: &Isometry2<f32>) -> Self {

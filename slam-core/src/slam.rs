@@ -86,7 +86,7 @@ pub enum ScanRejection {
 pub struct SlamUpdate {
     /// Pose of `base` in `map` at the scan's middle beam.
     pub pose: Isometry2<f32>,
-    /// Covariance of (x, y, θ), in `map`.
+    /// Covariance of (x, y, θ), in `map`, the error of the map around the robot included.
     pub covariance: Matrix3<f32>,
     /// Where the odometry alone put the base, from the last pose.
     pub predicted: Isometry2<f32>,
@@ -220,7 +220,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             if let Some(config) = self.config.loop_closure {
                 self.close_loop(&config, &mut update);
             }
-            self.extend_map(&prior, &mut update);
+            self.extend_map(&prior, motion, &mut update);
             self.forget(scan, &update);
         }
         self.count(&update);
@@ -436,12 +436,17 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// From pairs to map, and with it, in the joint estimate, to the pose.
-    fn extend_map(&mut self, prior: &Prior, update: &mut SlamUpdate) {
+    fn extend_map(&mut self, prior: &Prior, motion: &ScanMotion, update: &mut SlamUpdate) {
         update.residual_m = self.residual_m(&update.pose);
         let seen = Observed {
             segments: &self.observed,
             pairs: &self.pairs,
             stamp: Stamp { scan: self.counters.scans, way_m: self.way_m },
+            moved_m: if motion.is_finite() {
+                motion.since_previous.distance_m + motion.since_previous.turn_rad
+            } else {
+                0.0
+            },
             line_noise: &self.config.line_noise,
         };
         let (RegistrationConfig::Joint(config), Some(joint)) = (&self.config.registration, &mut self.joint)

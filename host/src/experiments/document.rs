@@ -42,6 +42,13 @@ fn metres(value: f64) -> String {
     if value.is_finite() { format!("{value:.3}") } else { "–".into() }
 }
 
+/// Share of the blueprint's corners that the maps have.
+fn corners_found<'a>(measured: impl Iterator<Item = &'a Measured> + Clone) -> String {
+    let found: usize = measured.clone().map(|m| m.judgement.corners_found).sum();
+    let named: usize = measured.map(|m| m.judgement.corners).sum();
+    format!("{:.0} %", 100.0 * found as f64 / named.max(1) as f64)
+}
+
 /// The drives of a world under a condition.
 fn drives<'a>(
     results: &'a Results,
@@ -59,6 +66,7 @@ pub fn buildings(results: &Results) -> Table {
         "corner error: mean",
         "median",
         "worst",
+        "corners found",
         "trajectory error, rmse",
         "final position",
         "final heading",
@@ -70,13 +78,14 @@ pub fn buildings(results: &Results) -> Table {
         let driven = all().count();
         if let Some(measured) = building.paper_measured_m {
             let mut row = vec![building.name.to_owned(), "as the paper measured".into(), metres(measured)];
-            row.resize(10, "–".into());
+            row.resize(11, "–".into());
             table.add_row(row);
         }
         table.add_row([
             building.name.to_owned(),
             "dead reckoning".into(),
             "no map".into(),
+            "–".into(),
             "–".into(),
             "–".into(),
             metres(mean(all().map(|r| r.dead_reckoning.ate_rmse_m))),
@@ -86,8 +95,11 @@ pub fn buildings(results: &Results) -> Table {
             "–".into(),
         ]);
         let paper: Vec<&Measured> = all().filter_map(|r| r.paper.as_ref()).collect();
+        let calibrated: Vec<&Measured> = all().filter_map(|r| r.paper_calibrated.as_ref()).collect();
         let default: Vec<&Measured> = all().map(|r| &r.default).collect();
-        for (name, measured) in [("paper", paper), ("default", default)] {
+        for (name, measured) in
+            [("paper", paper), ("paper, wheels calibrated", calibrated), ("default", default)]
+        {
             let over = |value: fn(&Measured) -> f64| mean(measured.iter().map(|m| value(m)));
             let corners = Spread::of(measured.iter().filter_map(|m| m.judgement.corner_error_m));
             let corner = |value: fn(&Spread) -> f64| metres(corners.as_ref().map_or(f64::NAN, value));
@@ -97,6 +109,7 @@ pub fn buildings(results: &Results) -> Table {
                 corner(|s| s.mean),
                 corner(|s| s.median),
                 corner(|s| s.worst),
+                corners_found(measured.iter().copied()),
                 metres(over(|m| m.judgement.ate_rmse_m)),
                 metres(over(|m| m.judgement.final_position_error_m)),
                 format!("{:.2}°", over(|m| m.judgement.final_heading_error_deg)),
@@ -124,17 +137,13 @@ pub fn robustness(results: &Results) -> Table {
             let all = || drives(results, building.name, index).map(|r| &r.default);
             let corners = Spread::of(all().filter_map(|m| m.judgement.corner_error_m));
             let corner = |value: fn(&Spread) -> f64| metres(corners.as_ref().map_or(f64::NAN, value));
-            let named: usize = all().map(|m| m.judgement.corners).sum();
             table.add_row([
                 condition.name.to_owned(),
                 building.name.into(),
                 corner(|s| s.mean),
                 corner(|s| s.worst),
                 metres(mean(all().map(|m| m.judgement.ate_rmse_m))),
-                format!(
-                    "{:.0} %",
-                    100.0 * all().map(|m| m.judgement.corners_found).sum::<usize>() as f64 / named as f64
-                ),
+                corners_found(all()),
                 format!("{} of {}", all().filter(|m| m.lost()).count(), all().count()),
             ]);
         }
@@ -231,6 +240,11 @@ pub fn recorded(recorded: &[Recorded]) -> Table {
     table
 }
 
+/// Mean trajectory error of the paper's algorithm in a building, in one of its two series.
+fn paper_error(results: &Results, world: &str, series: fn(&Run) -> Option<&Measured>) -> String {
+    metres(mean(drives(results, world, 0).filter_map(series).map(|m| m.judgement.ate_rmse_m)))
+}
+
 /// The page. `command` is what the reader types for it, `images` the figures' folder as seen from the page.
 pub fn render(results: &Results, command: &str, images: &str) -> String {
     let (first, last) = (results.seeds.start, results.seeds.end - 1);
@@ -260,13 +274,20 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
     say("The office, in which three people walk:");
     say(&format!("![Map of the office over its blueprint]({images}/office.svg)"));
     say("## Why `paper` is not the paper's figure");
-    say(
-        "The paper does not state its thresholds (RANSAC draws, inlier distance, gap, gate of the association), its speed, nor \
-         its\nodometry's quality; those of `SlamConfig::paper()` are ours. Its algorithm has no prior and no gate on direction: \
-         the pose is\nwherever the pairs pull it, and one wrong pair turns it. A scan that sees parallel walls only is solved \
-         along\nthem by the noise of their directions. Where that happens the drive counts as lost above, and its corner error \
-         is\nthat of the corners still found.",
-    );
+    say(&format!(
+        "The paper does not state its thresholds (RANSAC draws, inlier distance, gap, gate of the association, when a system is\n\
+         singular), its speed, nor how good its odometry was; those of `SlamConfig::paper()` are ours. Its algorithm has no\n\
+         prior and no gate on direction: the pose is where the pairs pull it, every segment that agrees with a wrong pose\n\
+         becomes map, and what the map says is never doubted again. So its error grows with that of the wheels, which the\n\
+         pose goes back to wherever a scan fixes too little. With wheels as good as the robot file says, its trajectory error\n\
+         (rmse) is {} m in the hall and {} m in the corridor, beside the paper's corner errors of 0.067 m and 0.234 m; with\n\
+         wheels that are 1 % off it is {} m and {} m. Where corners are 0.35 m or more away from the blueprint's they are not\n\
+         found, so that the corner errors of `paper` are those of the few corners near the start.",
+        paper_error(results, "hall", |r| r.paper_calibrated.as_ref()),
+        paper_error(results, "corridor", |r| r.paper_calibrated.as_ref()),
+        paper_error(results, "hall", |r| r.paper.as_ref()),
+        paper_error(results, "corridor", |r| r.paper.as_ref()),
+    ));
     say("## When the robot is worse");
     say("The default configuration, same seeds, same constants:");
     say(&robustness(results).to_string());
@@ -288,6 +309,10 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
             "Absolute trajectory error, rmse in metres after one SE(2) alignment, of the poses as the robot knew them then:",
         );
         say(&recorded(&results.recorded).to_string());
+        say(
+            "There is no pose graph. Where the column of closed loops is zero, coming back was enough: what is seen again pulls\n\
+             the pose, and with it the lines that are tracked.",
+        );
         say("Map and path (red), with the reference trajectory (green) laid on it, Fig. 10:");
         for log in &results.recorded {
             say(&format!("![Map of {}]({images}/{}.svg)", log.name, log.name));

@@ -22,12 +22,13 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
     let truth: Vec<Isometry2<f32>> =
         drive.truth.iter().map(|pose| nalgebra::convert_unchecked(map_from_world * pose)).collect();
     let title = format!("{}, seed {seed}", world.name);
-    let draw = |replay: &Replay, configuration: &str| {
-        svg::render(replay, &Scene { title: &title, configuration, blueprint: &blueprint, reference: &truth })
+    let draw = |replay: &Replay, subtitle: &str| {
+        svg::render(replay, &Scene { title: &title, subtitle, blueprint: &blueprint, reference: &truth })
     };
-    let mut figures = vec![(format!("{}.svg", world.name), draw(&replay, "default"))];
+    let mut figures = vec![(format!("{}.svg", world.name), draw(&replay, "default configuration"))];
     if world.name == "hall" {
-        figures.push((format!("{}_dead_reckoning.svg", world.name), draw(&by_wheels(replay), "no")));
+        figures
+            .push((format!("{}_dead_reckoning.svg", world.name), draw(&by_wheels(replay), "dead reckoning")));
     }
     Ok(figures)
 }
@@ -44,7 +45,8 @@ pub fn recorded(name: &str, log: &Log, replay: &Replay, reference: &[StampedPosi
         })
         .unwrap_or_default();
     let title = format!("{name} ({})", log.format);
-    let scene = Scene { title: &title, configuration: "default", reference: &reference, ..Scene::default() };
+    let scene =
+        Scene { title: &title, subtitle: "default configuration", reference: &reference, ..Scene::default() };
     (format!("{name}.svg"), svg::render(replay, &scene))
 }
 

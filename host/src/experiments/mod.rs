@@ -16,7 +16,7 @@ use crate::robot::Robot;
 use crate::score::{self, Relation, StampedPosition};
 use crate::sim::judge::{self, Judgement, TrajectoryErrors};
 use crate::sim::world::World;
-use crate::sim::{self, SimConfig};
+use crate::sim::{self, Drive, SimConfig, WheelModel};
 use crate::toml_file::FileError;
 
 /// A building of the experiments.
@@ -97,6 +97,8 @@ pub struct Run {
     pub default: Measured,
     /// What the paper's did, under the usual errors.
     pub paper: Option<Measured>,
+    /// The same on a drive whose wheels are as the robot file says, as the paper's must have been.
+    pub paper_calibrated: Option<Measured>,
     /// What the wheels said.
     pub dead_reckoning: TrajectoryErrors,
 }
@@ -222,24 +224,32 @@ pub fn run(options: &Options, progress: impl Fn() + Sync) -> Result<Results, Exp
     Ok(Results { seeds: options.seeds.clone(), runs, recorded, figures })
 }
 
-fn simulated(name: &'static str, world: &World, condition: usize, seed: u64) -> Result<Run, ReplayError> {
+/// One drive in a world, under a condition of [`CONDITIONS`].
+pub fn simulated(name: &'static str, world: &World, condition: usize, seed: u64) -> Result<Run, ReplayError> {
     let robot = Robot::usual_for("simulated");
     let mut errors = SimConfig::default();
     for setting in CONDITIONS[condition].settings {
         errors.set(setting).expect("the conditions are constants");
     }
-    let drive = sim::drive(world, &robot, &errors, seed)?;
-    let measure = |config: SlamConfig| -> Result<(Measured, Replay), ReplayError> {
+    let measure = |drive: &Drive, config: SlamConfig| -> Result<(Measured, Replay), ReplayError> {
         let replay = replay::run(&drive.log, &robot, config, || {})?;
-        let judgement = judge::judge(world, &drive, &replay);
+        let judgement = judge::judge(world, drive, &replay);
         Ok((Measured { judgement, segments: replay.map.len() }, replay))
     };
-    let (default, replay) = measure(SlamConfig::default())?;
-    let paper =
-        (condition == 0).then(|| measure(SlamConfig::paper())).transpose()?.map(|(measured, _)| measured);
+    let drive = sim::drive(world, &robot, &errors, seed)?;
+    let (default, replay) = measure(&drive, SlamConfig::default())?;
     let odometry = judge::in_world(&drive, replay.steps.iter().map(|s| s.odometry));
     let dead_reckoning = judge::trajectory_errors(&drive.truth, &odometry);
-    Ok(Run { world: name, condition, default, paper, dead_reckoning })
+    let (mut paper, mut paper_calibrated) = (None, None);
+    if condition == 0 {
+        paper = Some(measure(&drive, SlamConfig::paper())?.0);
+        let slip_m_per_sqrt_m = errors.wheel.slip_m_per_sqrt_m;
+        errors.wheel =
+            WheelModel { radius_error: 0.0, radius_difference: 0.0, track_error: 0.0, slip_m_per_sqrt_m };
+        let calibrated = sim::drive(world, &robot, &errors, seed)?;
+        paper_calibrated = Some(measure(&calibrated, SlamConfig::paper())?.0);
+    }
+    Ok(Run { world: name, condition, default, paper, paper_calibrated, dead_reckoning })
 }
 
 /// Measures one log and draws it; `None` where it is not there.

@@ -41,8 +41,8 @@ const POINT_CELL_M: f32 = 0.04;
 pub struct Scene<'a> {
     /// The title: name of the log or of the world.
     pub title: &'a str,
-    /// Name of the configuration.
-    pub configuration: &'a str,
+    /// What made the map, beneath the title.
+    pub subtitle: &'a str,
     /// The true walls in `map`, where they are known.
     pub blueprint: &'a [Edge],
     /// The trajectory to compare with, in `map`, where there is one.
@@ -280,8 +280,8 @@ fn label(x: f32, y: f32, size: u32, text: impl Into<String>) -> Text {
 fn header(replay: &Replay, scene: &Scene<'_>, view: &View) -> Group {
     let title = label(MARGIN_PX, 38.0, 24, scene.title).set("font-weight", 700);
     let facts = format!(
-        "{} configuration · {} scans · {:.0} m driven · {} segments",
-        scene.configuration,
+        "{} · {} scans · {:.0} m driven · {} segments",
+        scene.subtitle,
         replay.steps.len(),
         replay.distance_m,
         replay.map.len(),

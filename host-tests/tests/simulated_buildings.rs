@@ -1,0 +1,88 @@
+//! What is promised of the default configuration in simulated buildings, on seeds that nothing was tuned on.
+
+use std::path::Path;
+
+use lineslam::experiments::{FEATURELESS, Run, simulated};
+use lineslam::sim::world::World;
+
+const SEEDS: std::ops::Range<u64> = 301..309;
+
+fn drives(name: &'static str, condition: usize) -> Vec<Run> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../worlds").join(format!("{name}.toml"));
+    let world = World::load(&path).unwrap();
+    let drive = |seed: u64| simulated(name, &world, condition, seed).unwrap();
+    let (even, odd): (Vec<u64>, Vec<u64>) = SEEDS.partition(|seed| seed % 2 == 0);
+    std::thread::scope(|scope| {
+        let other = scope.spawn(|| even.into_iter().map(drive).collect::<Vec<Run>>());
+        let mut runs: Vec<Run> = odd.into_iter().map(drive).collect();
+        runs.extend(other.join().unwrap());
+        runs
+    })
+}
+
+/// Corner error of each drive, metres; no drive may lose track, no map may be without corners.
+fn corner_errors(runs: &[Run]) -> Vec<f64> {
+    for run in runs {
+        assert!(!run.default.lost(), "{}: {:?}", run.world, run.default.judgement);
+    }
+    runs.iter().map(|r| r.default.judgement.corner_error_m.expect("the map has corners")).collect()
+}
+
+fn holds(name: &'static str, mean_m: f64) {
+    let errors = corner_errors(&drives(name, 0));
+    let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+    let worst = errors.iter().copied().fold(0.0, f64::max);
+    println!("{name}: corner error {mean:.3} m, worst {worst:.3} m");
+    assert!(mean <= mean_m, "{name}: {mean:.3} m");
+    assert!(worst <= 3.0 * mean, "{name}: worst {worst:.3} m, mean {mean:.3} m");
+}
+
+#[test]
+fn the_hall_is_mapped() {
+    holds("hall", 0.035);
+}
+
+#[test]
+fn the_corridor_is_mapped() {
+    holds("corridor", 0.080);
+}
+
+#[test]
+fn the_office_is_mapped_while_people_walk() {
+    holds("office", 0.040);
+}
+
+#[test]
+fn the_hall_is_mapped_when_the_robot_is_worse() {
+    for condition in 1..5 {
+        let errors = corner_errors(&drives("hall", condition));
+        let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+        assert!(mean < 0.05, "condition {condition}: {mean:.3} m");
+    }
+}
+
+/// χ² with three degrees of freedom over eight drives: 95 % of their mean lies within 1.55 and 4.92; the promise is kept a
+/// little wider, as the pose's errors of one drive hang together.
+#[test]
+fn the_covariance_is_honest() {
+    for name in ["hall", "office"] {
+        let runs = drives(name, 0);
+        let nees = runs.iter().map(|r| r.default.judgement.mean_nees).sum::<f64>() / runs.len() as f64;
+        println!("{name}: NEES {nees:.2}");
+        assert!((1.3..5.5).contains(&nees), "{name}: {nees}");
+    }
+}
+
+#[test]
+fn between_two_parallel_walls_only_the_way_along_them_drifts() {
+    let runs = drives(FEATURELESS, 0);
+    let mean = |value: fn(&Run) -> f64| runs.iter().map(value).sum::<f64>() / runs.len() as f64;
+    let along = mean(|r| r.default.judgement.final_along_error_m);
+    let wheels = mean(|r| r.dead_reckoning.final_along_error_m);
+    assert!(along <= 1.1 * wheels, "along {along}, dead reckoning {wheels}");
+    for run in &runs {
+        let judgement = &run.default.judgement;
+        assert!(judgement.worst_across_error_m < 0.03, "{judgement:?}");
+        assert!(judgement.worst_heading_error_deg < 0.5, "{judgement:?}");
+    }
+}

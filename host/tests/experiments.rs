@@ -1,0 +1,51 @@
+//! `lineslam experiments`: one command, one page, with every table and figure it speaks of.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn worlds() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../worlds")
+}
+
+fn experiments(out: &Path, worlds: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_lineslam"))
+        .args(["experiments", "--seeds", "1", "--first-seed", "77", "--worlds"])
+        .arg(worlds)
+        .arg("--out")
+        .arg(out)
+        .env_remove("LINESLAM_DATA")
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn the_page_has_its_tables_figures_and_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = experiments(folder.path(), &worlds());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let page = std::fs::read_to_string(folder.path().join("experiments.md")).unwrap();
+    assert!(page.contains("experiments --seeds 1 --first-seed 77\n"), "the command that wrote it");
+    assert!(page.contains("0.067") && page.contains("0.234"), "the paper's own figures");
+    assert!(page.contains("Not run: no folder of recorded logs"), "what was left out is said");
+    for condition in ["wheel errors doubled", "±30 mm", "10 %", "every fifth scan"] {
+        assert!(page.contains(condition), "{condition}");
+    }
+    let images: Vec<&str> =
+        page.split("](images/").skip(1).map(|rest| rest.split_once(')').unwrap().0).collect();
+    assert_eq!(images, ["hall.svg", "hall_dead_reckoning.svg", "corridor.svg", "office.svg"]);
+    for image in images {
+        let svg = std::fs::read_to_string(folder.path().join("images").join(image)).unwrap();
+        assert!(svg.starts_with("<svg"), "{image}");
+    }
+    assert!(!page.contains("NaN"), "{page}");
+}
+
+#[test]
+fn a_world_that_is_missing_is_named_and_nothing_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let output = experiments(&out, folder.path());
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("hall.toml"), "{output:?}");
+    assert!(!out.exists());
+}
