@@ -110,7 +110,7 @@ struct ExperimentsArgs {
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
     seeds: u32,
     /// Seed of the first drive; the others follow.
-    #[arg(long, default_value_t = 101)]
+    #[arg(long, default_value_t = 1001)]
     first_seed: u64,
     /// Folder of the worlds hall, corridor, office and parallel.
     #[arg(long, value_name = "FOLDER", default_value = "worlds")]
