@@ -378,7 +378,8 @@ impl Joint {
     fn given_pose(&self, offset: usize, direction: usize) -> [f32; 2] {
         let inverse = self.pose_covariance().try_inverse();
         [offset, direction].map(|state| {
-            let own = self.get(state, state);
+            // Rounding may have taken a variance below zero, and a range must not be empty.
+            let own = self.get(state, state).max(LEAST_VARIANCE);
             let with = Vector3::from_fn(|i, _| self.get(POSE + i, state));
             let explained = inverse.map_or(0.0, |w| with.dot(&(w * with)));
             (own - explained).clamp(0.01 * own, own).max(LEAST_VARIANCE)
@@ -693,6 +694,20 @@ mod tests {
         let tracked = world.joint.owners.iter().flatten().count();
         assert_eq!(tracked, last, "one place is free, the last segment's is known by its new index");
         assert!(world.joint.place_of(0).is_some() && world.joint.place_of(last).is_none());
+    }
+
+    #[test]
+    fn variances_that_rounding_spoilt_are_survived() {
+        for spoilt in [-1e-3, f32::NAN, f32::INFINITY, 0.0] {
+            let mut world = World::new(4);
+            world.look();
+            for state in FIRST_LINE..world.joint.states() {
+                world.joint.set(state, state, spoilt);
+            }
+            let pose = world.joint.settle(&world.believed, &mut world.map);
+            assert!(crate::pose::is_finite(&pose));
+            assert!(world.map.segments().iter().all(|s| s.segment.is_finite()), "{spoilt}");
+        }
     }
 
     #[test]
