@@ -77,7 +77,7 @@ fn the_covariance_is_honest() {
 fn between_two_parallel_walls_only_the_way_along_them_drifts() {
     let runs = drives(FEATURELESS, 0);
     let mean = |value: fn(&Run) -> f64| runs.iter().map(value).sum::<f64>() / runs.len() as f64;
-    let along = mean(|r| r.default.judgement.final_along_error_m);
+    let along = mean(|r| r.default.judgement.trajectory.final_along_error_m);
     let wheels = mean(|r| r.dead_reckoning.final_along_error_m);
     assert!(along <= 1.1 * wheels, "along {along}, dead reckoning {wheels}");
     for run in &runs {

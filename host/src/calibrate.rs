@@ -16,7 +16,6 @@ use std::path::Path;
 use nalgebra::{Isometry2, SMatrix, SVector, Vector2, Vector3};
 use slam_core::SlamConfig;
 use slam_core::correction::Verdict;
-use slam_core::odometry::{ticks_between_u16, ticks_between_u32};
 use toml_edit::{DocumentMut, value};
 
 use crate::log::{Log, Odometry};
@@ -47,8 +46,8 @@ const DISTRUST: f32 = 4.0;
 const STEPS: usize = 20;
 /// Residuals beyond this many standard deviations count less.
 const KERNEL_SIGMAS: f64 = 2.0;
-/// Delays tried at the start, seconds.
-const DELAYS_S: std::ops::RangeInclusive<i32> = -20..=40;
+/// Delays tried at the start: so many times a step, in seconds.
+const DELAYS: std::ops::RangeInclusive<i32> = -20..=40;
 const DELAY_STEP_S: f64 = 0.01;
 
 /// One parameter of the robot.
@@ -149,8 +148,7 @@ pub fn calibrate(
     robot_path: &Path,
     mut progress: impl FnMut(),
 ) -> Result<Calibration, CalibrationError> {
-    let text = std::fs::read_to_string(robot_path)
-        .map_err(|source| FileError::Read { path: robot_path.to_owned(), source })?;
+    let text = toml_file::read(robot_path)?;
     let robot: Robot = toml_file::parse(&text, robot_path)?;
     let wheels = robot.wheels.ok_or_else(|| ReplayError::NoWheels { robot: robot.name.clone() })?;
     // The text has just been parsed.
@@ -227,11 +225,7 @@ impl WheelTurns {
         for (stamp_us, odometry) in &log.odometry {
             let Odometry::Ticks(ticks) = odometry else { return None };
             let before = last.replace(*ticks).unwrap_or(*ticks);
-            for (side, turn) in turns.iter_mut().enumerate() {
-                let moved = match wheels.counter_bits {
-                    16 => ticks_between_u16(before[side] as u16, ticks[side] as u16),
-                    _ => ticks_between_u32(before[side] as u32, ticks[side] as u32),
-                };
+            for (turn, moved) in turns.iter_mut().zip(wheels.ticks_between(before, *ticks)) {
                 *turn += f64::from(moved) * per_tick;
             }
             samples.push((*stamp_us as f64 * 1e-6, turns));
@@ -340,7 +334,7 @@ fn best_delay(p: &Vector, windows: &[Window], ticks: &WheelTurns) -> f64 {
         // The turns tell it; their median misfit is blind to bad windows.
         scales(&p, windows, ticks)[2]
     };
-    let delays = DELAYS_S.map(|k| f64::from(k) * DELAY_STEP_S);
+    let delays = DELAYS.map(|k| f64::from(k) * DELAY_STEP_S);
     delays.min_by(|a, b| misfit(*a).total_cmp(&misfit(*b))).unwrap_or(p[3])
 }
 

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use nalgebra::{Isometry2, Point2};
 use slam_core::config::ConfigError;
 use slam_core::map::{MapCounters, MapSegment};
-use slam_core::odometry::{Increment, ticks_between_u16, ticks_between_u32};
+use slam_core::odometry::Increment;
 use slam_core::pose::pose;
 use slam_core::slam::Counters;
 use slam_core::{OdometryTrack, Scan, Slam, SlamConfig, SlamUpdate};
@@ -15,6 +15,8 @@ use crate::robot::Robot;
 
 /// Map segments of the replayed `Slam`: what the firmware has.
 pub const MAP_SEGMENTS: usize = 512;
+/// Map segments seen in fewer scans are not yet sure: drawn thin, and not judged.
+pub const ESTABLISHED_HITS: u16 = 3;
 /// Beams of the replayed `Slam` for a URG-04LX, and for anything with more.
 const URG_BEAMS: usize = 682;
 const MOST_BEAMS: usize = 2048;
@@ -200,11 +202,8 @@ impl<'a> OdometryFeed<'a> {
                 let Some((wheels, drive)) = self.robot.wheels.zip(self.robot.drive()) else {
                     return Increment::identity();
                 };
-                let between = |i: usize| match wheels.counter_bits {
-                    16 => ticks_between_u16(before[i] as u16, after[i] as u16),
-                    _ => ticks_between_u32(before[i] as u32, after[i] as u32),
-                };
-                drive.increment(between(0), between(1), self.config.odometry.integration)
+                let [left, right] = wheels.ticks_between(before, after);
+                drive.increment(left, right, self.config.odometry.integration)
             }
             (Odometry::Pose(before), Odometry::Pose(after)) => {
                 let (s, c) = before[2].sin_cos();

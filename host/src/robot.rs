@@ -6,7 +6,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 use slam_core::SlamConfig;
-use slam_core::odometry::{DifferentialDrive, OdometryNoise};
+use slam_core::odometry::{DifferentialDrive, OdometryNoise, ticks_between_u16, ticks_between_u32};
 use slam_core::pose::pose;
 use slam_core::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry};
 
@@ -42,6 +42,16 @@ pub struct Wheels {
     pub ticks_per_turn: f32,
     /// Width of the counters, after which they wrap: 16 or 32.
     pub counter_bits: u8,
+}
+
+impl Wheels {
+    /// Ticks of the left and right wheel between two readings of counters this wide.
+    pub fn ticks_between(&self, before: [i64; 2], after: [i64; 2]) -> [i32; 2] {
+        [0, 1].map(|side| match self.counter_bits {
+            16 => ticks_between_u16(before[side] as u16, after[side] as u16),
+            _ => ticks_between_u32(before[side] as u32, after[side] as u32),
+        })
+    }
 }
 
 /// `[odometry_noise]`, standard deviations that grow with the square root of the way.

@@ -46,9 +46,12 @@ pub trait Checked: DeserializeOwned {
 
 /// Reads and checks a file.
 pub fn load<T: Checked>(path: &Path) -> Result<T, FileError> {
-    let text =
-        std::fs::read_to_string(path).map_err(|source| FileError::Read { path: path.to_owned(), source })?;
-    parse(&text, path)
+    parse(&read(path)?, path)
+}
+
+/// The text of a file.
+pub fn read(path: &Path) -> Result<String, FileError> {
+    std::fs::read_to_string(path).map_err(|source| FileError::Read { path: path.to_owned(), source })
 }
 
 /// Checks a text that stands in a file.

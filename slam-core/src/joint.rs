@@ -323,6 +323,7 @@ impl Joint {
         // position, and shifts a line along its new normal.
         self.add_states(POSE, &[(POSE + 2, -part(POSE + 1))]);
         self.add_states(POSE + 1, &[(POSE + 2, part(POSE))]);
+        let pose_information = self.pose_covariance().try_inverse();
         for place in 0..LINES {
             let Some(owner) = self.owners.get(place).copied().flatten() else { continue };
             let Some(entry) = map.get_mut(usize::from(owner)) else { continue };
@@ -331,7 +332,7 @@ impl Joint {
             let turned = moved.normal() - entry.segment.normal();
             let [by_pose, _] = pose_rows(turned, moved.moments.centroid.coords - settled.translation.vector);
             self.add_states(offset, &by_pose);
-            let moved = self.centred(&moved, place);
+            let moved = self.centred(&moved, place, pose_information.as_ref());
             if moved.is_finite() {
                 entry.segment = moved;
             }
@@ -359,7 +360,12 @@ impl Joint {
 
     /// The segment with its centroid where offset and direction are independent, within its ends, and with its variances
     /// given the pose.
-    fn centred(&mut self, segment: &Segment, place: usize) -> Segment {
+    fn centred(
+        &mut self,
+        segment: &Segment,
+        place: usize,
+        pose_information: Option<&Matrix3<f32>>,
+    ) -> Segment {
         let [offset, direction] = states_of(place);
         let mut segment = *segment;
         let var_direction = self.get(direction, direction);
@@ -370,20 +376,18 @@ impl Joint {
             self.add_states(offset, &[(direction, way)]);
             segment.moments.centroid += segment.direction * way;
         }
-        let given_pose = self.given_pose(offset, direction);
-        with_variances(&segment, given_pose[0], given_pose[1])
+        let [var_offset, var_direction] =
+            [offset, direction].map(|state| self.given_pose(state, pose_information));
+        with_variances(&segment, var_offset, var_direction)
     }
 
-    /// Variances of a line's offset and direction if the pose were known.
-    fn given_pose(&self, offset: usize, direction: usize) -> [f32; 2] {
-        let inverse = self.pose_covariance().try_inverse();
-        [offset, direction].map(|state| {
-            // Rounding may have taken a variance below zero, and a range must not be empty.
-            let own = self.get(state, state).max(LEAST_VARIANCE);
-            let with = Vector3::from_fn(|i, _| self.get(POSE + i, state));
-            let explained = inverse.map_or(0.0, |w| with.dot(&(w * with)));
-            (own - explained).clamp(0.01 * own, own).max(LEAST_VARIANCE)
-        })
+    /// Variance of a line's state if the pose were known.
+    fn given_pose(&self, state: usize, pose_information: Option<&Matrix3<f32>>) -> f32 {
+        // Rounding may have taken a variance below zero, and a range must not be empty.
+        let own = self.get(state, state).max(LEAST_VARIANCE);
+        let with = Vector3::from_fn(|i, _| self.get(POSE + i, state));
+        let explained = pose_information.map_or(0.0, |w| with.dot(&(w * with)));
+        (own - explained).clamp(0.01 * own, own).max(LEAST_VARIANCE)
     }
 
     /// Tracks a segment just added to the map, seen from the pose with these variances of its own.

@@ -110,9 +110,9 @@ pub fn buildings(results: &Results) -> Table {
                 corner(|s| s.median),
                 corner(|s| s.worst),
                 corners_found(measured.iter().copied()),
-                metres(over(|m| m.judgement.ate_rmse_m)),
-                metres(over(|m| m.judgement.final_position_error_m)),
-                format!("{:.2}°", over(|m| m.judgement.final_heading_error_deg)),
+                metres(over(|m| m.judgement.trajectory.ate_rmse_m)),
+                metres(over(|m| m.judgement.trajectory.final_position_error_m)),
+                format!("{:.2}°", over(|m| m.judgement.trajectory.final_heading_error_deg)),
                 format!("{:.0}", over(|m| m.segments as f64)),
                 format!("{} of {driven}", measured.iter().filter(|m| m.lost()).count()),
             ]);
@@ -142,7 +142,7 @@ pub fn robustness(results: &Results) -> Table {
                 building.name.into(),
                 corner(|s| s.mean),
                 corner(|s| s.worst),
-                metres(mean(all().map(|m| m.judgement.ate_rmse_m))),
+                metres(mean(all().map(|m| m.judgement.trajectory.ate_rmse_m))),
                 corners_found(all()),
                 format!("{} of {}", all().filter(|m| m.lost()).count(), all().count()),
             ]);
@@ -203,7 +203,7 @@ pub fn featureless(results: &Results) -> Table {
         table.add_row([name.to_owned(), shown(|s| s.mean), shown(|s| s.worst)]);
     };
     let along = "final error along the walls";
-    row(along, "m", 3, all().map(|r| r.default.judgement.final_along_error_m).collect());
+    row(along, "m", 3, all().map(|r| r.default.judgement.trajectory.final_along_error_m).collect());
     let wheels = "the same of dead reckoning";
     row(wheels, "m", 3, all().map(|r| r.dead_reckoning.final_along_error_m).collect());
     let across = "largest error across, of a drive";
@@ -242,7 +242,7 @@ pub fn recorded(recorded: &[Recorded]) -> Table {
 
 /// Mean trajectory error of the paper's algorithm in a building, in one of its two series.
 fn paper_error(results: &Results, world: &str, series: fn(&Run) -> Option<&Measured>) -> String {
-    metres(mean(drives(results, world, 0).filter_map(series).map(|m| m.judgement.ate_rmse_m)))
+    metres(mean(drives(results, world, 0).filter_map(series).map(|m| m.judgement.trajectory.ate_rmse_m)))
 }
 
 /// The page. `command` is what the reader types for it, `images` the figures' folder as seen from the page.

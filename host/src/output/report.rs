@@ -93,8 +93,11 @@ impl SimulationReport {
         let beside = |ours: f64, theirs: f64| format!("{ours:.3} m, dead reckoning {theirs:.3} m");
         vec![
             ("corner error, eq. (11)", corners),
-            ("trajectory error, rmse", beside(j.ate_rmse_m, dead.ate_rmse_m)),
-            ("final position error", beside(j.final_position_error_m, dead.final_position_error_m)),
+            ("trajectory error, rmse", beside(j.trajectory.ate_rmse_m, dead.ate_rmse_m)),
+            (
+                "final position error",
+                beside(j.trajectory.final_position_error_m, dead.final_position_error_m),
+            ),
         ]
     }
 }

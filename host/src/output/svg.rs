@@ -12,7 +12,7 @@ use svg::Document;
 use svg::node::element::{Circle, Group, Line, Path, Rectangle, Text};
 
 use super::bounds;
-use crate::replay::Replay;
+use crate::replay::{ESTABLISHED_HITS, Replay};
 use crate::sim::world::Edge;
 
 const PAPER: &str = "#fbfaf7";
@@ -25,8 +25,6 @@ const BLUEPRINT: &str = "#cfe3d8";
 const START: &str = "#2a9d8f";
 const FONT: &str = "Inter, Helvetica, Arial, sans-serif";
 
-/// Segments seen in fewer scans are drawn thin.
-const ESTABLISHED_HITS: u16 = 3;
 /// Longer edge of the drawing, pixels.
 const LONG_EDGE_PX: f32 = 1400.0;
 const MARGIN_PX: f32 = 36.0;

@@ -5,7 +5,7 @@ use slam_core::{MapSegment, Segment};
 
 use super::Drive;
 use super::world::{Disc, Edge, World};
-use crate::replay::{Replay, Step};
+use crate::replay::{ESTABLISHED_HITS, Replay, Step};
 use crate::score::{StampedPosition, absolute_trajectory_error};
 
 /// A map line stands for a blueprint wall when it passes this close to the corner, metres, …
@@ -20,8 +20,6 @@ const SIDE_PROBE_M: [f64; 2] = [0.2, 0.02];
 const SIGHTING_STEP: usize = 5;
 /// A segment farther than this from everything that stands still is spurious, metres.
 const SPURIOUS_M: f64 = 0.15;
-/// Map segments seen in fewer scans are not yet part of the map that is judged.
-const ESTABLISHED_HITS: u16 = 3;
 
 /// Instants of a drive at which the pose's error is held against its covariance.
 pub const NEES_INSTANTS: usize = 50;
@@ -36,20 +34,15 @@ pub struct Judgement {
     pub corners_found: usize,
     /// Corners of the blueprint.
     pub corners: usize,
-    /// Root mean square position error after one SE(2) alignment, metres.
-    pub ate_rmse_m: f64,
-    /// Distance of the last pose from the truth, metres, in the frame of the start.
-    pub final_position_error_m: f64,
-    /// Error of the last heading, degrees.
-    pub final_heading_error_deg: f64,
+    /// Errors of the trajectory, in the frame of the start.
+    #[serde(flatten)]
+    pub trajectory: TrajectoryErrors,
     /// Largest distance of a pose from the truth, metres, in the frame of the start.
     pub worst_position_error_m: f64,
     /// Largest error of a heading, degrees.
     pub worst_heading_error_deg: f64,
     /// Largest error of a position across the robot's heading, metres.
     pub worst_across_error_m: f64,
-    /// Error of the last position along the robot's heading, metres.
-    pub final_along_error_m: f64,
     /// Share of the poses whose error along the robot's heading is within two of its reported standard deviations.
     pub along_within_two_sigma: f64,
     /// Mean of the normalised estimation error squared of the pose (3 is honest).
@@ -103,7 +96,6 @@ pub fn in_world(drive: &Drive, poses: impl Iterator<Item = Isometry2<f32>>) -> V
 /// Judges a replay of a simulated drive.
 pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
     let poses = in_world(drive, replay.steps.iter().map(|s| s.pose));
-    let errors = trajectory_errors(&drive.truth, &poses);
     let off: Vec<PoseError> = drive.truth.iter().zip(&poses).map(|(t, p)| PoseError::new(t, p)).collect();
     let worst = |size: fn(&PoseError) -> f64| off.iter().map(size).fold(0.0, f64::max);
     let covariances: Vec<Matrix3<f64>> = replay
@@ -126,13 +118,10 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
         corner_error_m: (!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64),
         corners_found: found.len(),
         corners: world.corners.len(),
-        ate_rmse_m: errors.ate_rmse_m,
-        final_position_error_m: errors.final_position_error_m,
-        final_heading_error_deg: errors.final_heading_error_deg,
+        trajectory: trajectory_errors(&drive.truth, &poses),
         worst_position_error_m: worst(|off| off.along_m.hypot(off.across_m)),
         worst_heading_error_deg: worst(|off| off.heading_rad.abs()).to_degrees(),
         worst_across_error_m: worst(|off| off.across_m.abs()),
-        final_along_error_m: errors.final_along_error_m,
         along_within_two_sigma: covered.count() as f64 / off.len().max(1) as f64,
         mean_nees: all_nees.iter().sum::<f64>() / all_nees.len().max(1) as f64,
         nees: (1..=NEES_INSTANTS).filter_map(|i| nees(i * last / NEES_INSTANTS)).collect(),

@@ -169,14 +169,11 @@ fn farthest_from_chord(points: &[ScanPoint], view: &Viewpoint<'_>, sigmas: f32) 
 fn two_lines(points: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConfig) -> Option<usize> {
     let coarse = (points.len() / PARTS).max(1);
     let normal = chord_normal(points)?;
-    let sums = |part: &[ScanPoint]| {
-        Moments::from_points(part.iter().map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
-    };
-    let all = sums(points);
+    let all = weighed_moments(points, normal, view);
     // χ² saved by two lines over what two lines of chance would save; positive where a cut is due.
     let saved = |cut: usize| {
         let (a, b) = points.split_at_checked(cut).filter(|(a, b)| a.len().min(b.len()) >= LEAST_PART)?;
-        let (a, b) = (sums(a), sums(b));
+        let (a, b) = (weighed_moments(a, normal, view), weighed_moments(b, normal, view));
         let cost = all.residual() - a.residual() - b.residual();
         let due = cost - joining_limit(&a, &b, config);
         (due > 0.0).then_some((cut, cost))
@@ -199,6 +196,11 @@ fn chord_normal(points: &[ScanPoint]) -> Option<Vector2<f32>> {
 fn chord_moments(points: &[ScanPoint], view: &Viewpoint<'_>) -> Moments {
     // A run that ends where it began has no surface; x serves as well as any.
     let normal = chord_normal(points).unwrap_or_else(Vector2::x);
+    weighed_moments(points, normal, view)
+}
+
+/// Sums over points of a surface with this normal, each weighed by its noise across it.
+fn weighed_moments(points: &[ScanPoint], normal: Vector2<f32>, view: &Viewpoint<'_>) -> Moments {
     Moments::from_points(points.iter().map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
 }
 
