@@ -8,6 +8,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use comfy_table::{Table, presets};
+use host_tests::{data, root, skipped};
 use lineslam::log::{self, Format, ReadOptions};
 use lineslam::output::tum;
 use lineslam::replay::{self, Replay};
@@ -72,27 +73,8 @@ const LOGS: [Recorded; 5] = [
     },
 ];
 
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
-fn data() -> PathBuf {
-    std::env::var_os("LINESLAM_DATA").map_or_else(|| root().join("../shared/data"), PathBuf::from)
-}
-
-/// Says plainly that a test did nothing. Written past the test harness's capture, so that it is seen.
-fn skipped(test: &str, missing: &Path) {
-    use std::io::Write;
-    let _ = writeln!(std::io::stdout(), "\nSKIPPED {test}: {} is not there", missing.display());
-}
-
 fn path(recorded: &Recorded, test: &str) -> Option<PathBuf> {
-    let path = data().join(recorded.file);
-    if !path.exists() {
-        skipped(test, &path);
-        return None;
-    }
-    Some(path)
+    host_tests::recorded(recorded.file, test)
 }
 
 fn replay(path: &Path, config: SlamConfig) -> Replay {

@@ -9,5 +9,6 @@ pub mod output;
 pub mod replay;
 pub mod robot;
 pub mod score;
+pub mod serial;
 pub mod sim;
 pub mod toml_file;

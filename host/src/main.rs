@@ -13,14 +13,17 @@ use lineslam::calibrate::{self, CalibrationError};
 use lineslam::experiments::{self, ExperimentError, document};
 use lineslam::log::{self, Format, Log, ReadOptions};
 use lineslam::output::report::{Report, SimulationReport};
+use lineslam::output::scan::{self, Beams};
 use lineslam::output::svg::Scene;
 use lineslam::output::{self, csv, grid, svg, tum};
 use lineslam::replay::{self, Replay, ReplayError};
 use lineslam::robot::Robot;
+use lineslam::serial::{self, OneScan};
 use lineslam::sim::world::World;
 use lineslam::sim::{self, BadSetting, SimConfig, judge};
 use lineslam::toml_file::FileError;
 use slam_core::SlamConfig;
+use slam_core::scan::{RangeCodes, ScanGeometry};
 
 /// Line-segment SLAM, the same core as on the microcontroller.
 #[derive(Parser)]
@@ -40,6 +43,8 @@ enum Command {
     Calibrate(CalibrateArgs),
     /// Run the paper's experiments and more, and write the page with tables and figures.
     Experiments(ExperimentsArgs),
+    /// Ask a sensor on a serial port who it is and draw one of its scans.
+    Scan(ScanArgs),
 }
 
 #[derive(Args)]
@@ -123,6 +128,22 @@ struct ExperimentsArgs {
     out: PathBuf,
 }
 
+#[derive(Args)]
+struct ScanArgs {
+    /// Serial port of the sensor, such as /dev/ttyACM0.
+    #[arg(long, value_name = "DEVICE")]
+    port: String,
+    /// Bit rate to work at; a sensor on USB takes any.
+    #[arg(long, default_value_t = 115_200, value_name = "BIT/S")]
+    baud_rate: u32,
+    /// Attempts to connect.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    attempts: u32,
+    /// The drawing.
+    #[arg(long, value_name = "FILE", default_value = "scan.svg")]
+    out: PathBuf,
+}
+
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Configuration {
     Default,
@@ -159,6 +180,7 @@ fn main() -> ExitCode {
         Command::Simulate(args) => simulate(&args),
         Command::Calibrate(args) => run_calibrate(&args),
         Command::Experiments(args) => run_experiments(&args),
+        Command::Scan(args) => run_scan(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -238,9 +260,7 @@ fn run_calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     for column in table.column_iter_mut().skip(1).take(3) {
         column.set_cell_alignment(CellAlignment::Right);
     }
-    let (folder, name) = (args.out.parent().unwrap_or(Path::new("")), args.out.file_name());
-    let name = name.context("--out is not a file name")?;
-    output::write_all(folder, &[(name, result.robot_file.into_bytes())])?;
+    write_one(&args.out, result.robot_file)?;
     println!("{table}\n\nby {} windows; written to {}", result.windows, args.out.display());
     Ok(())
 }
@@ -272,6 +292,54 @@ fn run_experiments(args: &ExperimentsArgs) -> anyhow::Result<()> {
     }
     println!("\nwritten to {}", args.out.join("experiments.md").display());
     Ok(())
+}
+
+fn run_scan(args: &ScanArgs) -> anyhow::Result<()> {
+    let OneScan { info, baud_rate, ranges_mm } = serial::one_scan(&args.port, args.baud_rate, args.attempts)?;
+    let (geometry, codes) = (ScanGeometry::from(&info), RangeCodes::from(&info));
+    let beams = Beams::count(&ranges_mm, &codes);
+    let seen = format!(
+        "{} ranges, {} beams with nothing in range, {} not measured",
+        beams.ranges, beams.no_echo, beams.bad
+    );
+    let title = format!("{} {}", info.product, info.serial);
+    write_one(&args.out, scan::render(&title, &seen, &geometry, &codes, &ranges_mm))?;
+    let degrees = |beam: usize| geometry.bearing(beam).to_degrees();
+    let field = format!(
+        "{} beams from {:.1}° to {:.1}°, {} to {} mm, {} rpm",
+        info.beams(),
+        degrees(0),
+        degrees(info.beams() - 1),
+        info.min_range_mm,
+        info.max_range_mm,
+        info.revolutions_per_minute
+    );
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    let rows = [
+        ("port", format!("{} at {baud_rate} bit/s", args.port)),
+        ("model", info.model.to_string()),
+        ("vendor", info.vendor.to_string()),
+        ("product", info.product.to_string()),
+        ("firmware", info.firmware.to_string()),
+        ("protocol", info.protocol.to_string()),
+        ("serial number", info.serial.to_string()),
+        ("field of view", field),
+        ("scan", seen),
+        ("written to", args.out.display().to_string()),
+    ];
+    for (name, value) in rows {
+        table.add_row([name.to_owned(), value]);
+    }
+    println!("{table}");
+    Ok(())
+}
+
+/// Writes a single file, whole or not at all.
+fn write_one(path: &Path, text: String) -> anyhow::Result<()> {
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let name = path.file_name().context("--out is not a file name")?;
+    Ok(output::write_all(folder, &[(name, text.into_bytes())])?)
 }
 
 fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Replay, ReplayError> {

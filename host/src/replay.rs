@@ -38,7 +38,7 @@ pub enum ReplayError {
     #[error("the log has no odometry")]
     NoOdometry,
     /// Robot and configuration do not make sense together.
-    #[error("robot '{robot}': {source}")]
+    #[error("robot '{robot}'")]
     Config {
         /// Name of the robot.
         robot: String,

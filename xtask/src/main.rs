@@ -1,7 +1,9 @@
 //! `cargo xtask`: one word for each thing a person or CI does.
 #![forbid(unsafe_code)]
 
+mod bench;
 mod run;
+mod size;
 mod test;
 
 use std::process::ExitCode;
@@ -21,13 +23,19 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Task {
-    /// Everything CI runs: format, clippy for host and target, docs, all tests.
+    /// Everything CI runs: format, clippy for host and target, docs, sizes, costs, all tests.
     Test,
+    /// Flash and RAM of the driver on the microcontroller.
+    Size,
+    /// Instructions that decoding a scan takes, counted by callgrind.
+    Bench,
 }
 
 fn main() -> ExitCode {
     let done = match Cli::parse().task {
         Task::Test => test::everything(),
+        Task::Size => size::report(),
+        Task::Bench => bench::report(),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

@@ -55,3 +55,25 @@ pub fn ensure_target() -> anyhow::Result<()> {
     }
     step(&format!("install target {TARGET}"), program("rustup").args(["target", "add", TARGET]))
 }
+
+/// Installs a Debian package if its program is not there.
+pub fn debian_package(name: &str, command: &str) -> anyhow::Result<()> {
+    let there = program(command).arg("--version").output().is_ok_and(|o| o.status.success());
+    if there {
+        return Ok(());
+    }
+    let is_root = program("id").arg("-u").output().is_ok_and(|o| o.stdout.trim_ascii() == b"0");
+    let apt = |arguments: &str| {
+        let mut command = if is_root {
+            program("apt-get")
+        } else {
+            let mut sudo = program("sudo");
+            sudo.arg("apt-get");
+            sudo
+        };
+        command.args(arguments.split_whitespace());
+        command
+    };
+    step("update the list of Debian packages", &mut apt("update -qq"))?;
+    step(&format!("install {name}"), &mut apt(&format!("install -y -qq {name}")))
+}

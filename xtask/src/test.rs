@@ -6,21 +6,29 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 
-use crate::TARGET;
 use crate::run::{announce, cargo, ensure_target, program, root, step};
+use crate::{TARGET, bench, size};
 
 /// Runs every check, cheapest first; the tests come last and close with their sum.
 pub fn everything() -> anyhow::Result<()> {
     ensure_target()?;
     step("format", &mut cargo("fmt --all --check"))?;
     step("clippy, host", &mut cargo("clippy --workspace --all-targets -- -D warnings"))?;
-    let features = "slam-core/defmt,slam-core/serde";
-    for arguments in ["", "--features defmt,serde"] {
-        let command = format!("clippy -p slam-core --target {TARGET} {arguments} -- -D warnings");
-        step(&format!("clippy, slam-core for {TARGET} {arguments}"), &mut cargo(&command))?;
+    for arguments in [
+        "-p slam-core",
+        "-p slam-core --features defmt,serde",
+        "-p scip",
+        "-p scip --all-features",
+        "-p footprint",
+    ] {
+        let command = format!("clippy {arguments} --target {TARGET} -- -D warnings");
+        step(&format!("clippy for {TARGET}: {arguments}"), &mut cargo(&command))?;
     }
+    let features = "slam-core/defmt,slam-core/serde,scip/defmt,scip/embassy-time,scip/sim,scip/slam-core";
     let mut docs = cargo(&format!("doc --workspace --no-deps --features {features}"));
     step("docs", docs.env("RUSTDOCFLAGS", "-D warnings"))?;
+    size::report()?;
+    bench::report()?;
     let python = referee_python();
     tests(python)
 }

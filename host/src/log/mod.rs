@@ -105,7 +105,7 @@ impl fmt::Display for Defect {
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
     /// The file could not be read, or its compression is broken.
-    #[error("{}: line {line}: {source}", path.display())]
+    #[error("{}: line {line}", path.display())]
     Read {
         /// The log.
         path: PathBuf,

@@ -4,6 +4,7 @@
 pub mod csv;
 pub mod grid;
 pub mod report;
+pub mod scan;
 pub mod svg;
 pub mod tum;
 
@@ -22,7 +23,7 @@ fn bounds(points: impl Iterator<Item = Point2<f32>>) -> (Point2<f32>, Point2<f32
 
 /// The files could not be written; none was.
 #[derive(Debug, thiserror::Error)]
-#[error("{}: {source}", path.display())]
+#[error("{}", path.display())]
 pub struct WriteError {
     /// File or folder.
     pub path: PathBuf,

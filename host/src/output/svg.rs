@@ -15,14 +15,14 @@ use super::bounds;
 use crate::replay::{ESTABLISHED_HITS, Replay};
 use crate::sim::world::Edge;
 
-const PAPER: &str = "#fbfaf7";
+pub(super) const PAPER: &str = "#fbfaf7";
 const INK: &str = "#1d2b3a";
 const FAINT: &str = "#8fa3b5";
-const WALL: &str = "#16324f";
-const PATH: &str = "#d1495b";
+pub(super) const WALL: &str = "#16324f";
+pub(super) const PATH: &str = "#d1495b";
 const ODOMETRY: &str = "#edae49";
 const BLUEPRINT: &str = "#cfe3d8";
-const START: &str = "#2a9d8f";
+pub(super) const START: &str = "#2a9d8f";
 const FONT: &str = "Inter, Helvetica, Arial, sans-serif";
 
 /// Longer edge of the drawing, pixels.
@@ -48,10 +48,10 @@ pub struct Scene<'a> {
 }
 
 /// Where `map` lies on the paper.
-struct View {
+pub(super) struct View {
     low: Point2<f32>,
     high: Point2<f32>,
-    px_per_m: f32,
+    pub(super) px_per_m: f32,
     left_px: f32,
     width_px: f32,
     height_px: f32,
@@ -69,7 +69,12 @@ impl View {
         );
         points.extend(scene.blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
         points.extend(replay.steps.iter().map(|s| Point2::from(s.pose_in_final_map.translation.vector)));
-        let (low, high) = bounds(points.into_iter());
+        Self::of(points.into_iter())
+    }
+
+    /// Around points, with a margin.
+    pub(super) fn of(points: impl Iterator<Item = Point2<f32>>) -> Self {
+        let (low, high) = bounds(points);
         // At least two metres, so that a robot that stands still has a picture too.
         let centre = nalgebra::center(&low, &high);
         let half = ((high - low) * 0.5).sup(&Vector2::new(1.0, 1.0)) + Vector2::new(0.4, 0.4);
@@ -81,7 +86,18 @@ impl View {
         Self { low, high, px_per_m, left_px: 0.5 * (width_px - drawn_px), width_px, height_px }
     }
 
-    fn px(&self, point: Point2<f32>) -> (f32, f32) {
+    /// An empty sheet with its metre grid.
+    pub(super) fn sheet(&self) -> Document {
+        Document::new()
+            .set("viewBox", (0, 0, self.width_px.round() as i32, self.height_px.round() as i32))
+            .set("width", self.width_px.round())
+            .set("height", self.height_px.round())
+            .set("font-family", FONT)
+            .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", PAPER))
+            .add(metre_grid(self))
+    }
+
+    pub(super) fn px(&self, point: Point2<f32>) -> (f32, f32) {
         let x = self.left_px + (point.x - self.low.x) * self.px_per_m;
         let y = HEADER_PX + (self.high.y - point.y) * self.px_per_m;
         ((x * 10.0).round() / 10.0, (y * 10.0).round() / 10.0)
@@ -95,13 +111,8 @@ impl View {
 /// Renders the drawing, over the blueprint where there is one.
 pub fn render(replay: &Replay, scene: &Scene<'_>) -> String {
     let view = View::around(replay, scene);
-    let document = Document::new()
-        .set("viewBox", (0, 0, view.width_px.round() as i32, view.height_px.round() as i32))
-        .set("width", view.width_px.round())
-        .set("height", view.height_px.round())
-        .set("font-family", FONT)
-        .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", PAPER))
-        .add(metre_grid(&view))
+    let document = view
+        .sheet()
         .add(blueprint_lines(scene.blueprint, &view))
         .add(scan_points(replay, &view))
         .add(dead_reckoning(replay, &view))
@@ -276,7 +287,6 @@ fn label(x: f32, y: f32, size: u32, text: impl Into<String>) -> Text {
 }
 
 fn header(replay: &Replay, scene: &Scene<'_>, view: &View) -> Group {
-    let title = label(MARGIN_PX, 38.0, 24, scene.title).set("font-weight", 700);
     let facts = format!(
         "{} · {} scans · {:.0} m driven · {} segments",
         scene.subtitle,
@@ -284,6 +294,12 @@ fn header(replay: &Replay, scene: &Scene<'_>, view: &View) -> Group {
         replay.distance_m,
         replay.map.len(),
     );
+    heading(scene.title, &facts, view)
+}
+
+/// Title, what is below it, and a rule.
+pub(super) fn heading(title: &str, facts: &str, view: &View) -> Group {
+    let title = label(MARGIN_PX, 38.0, 24, title).set("font-weight", 700);
     let rule = Line::new()
         .set("x1", MARGIN_PX)
         .set("x2", view.width_px - MARGIN_PX)
@@ -295,13 +311,6 @@ fn header(replay: &Replay, scene: &Scene<'_>, view: &View) -> Group {
 
 /// Scale bar on the left, legend on the right.
 fn footer(scene: &Scene<'_>, view: &View) -> Group {
-    let y = view.height_px - 24.0;
-    let metres = scale_step(view);
-    let length_px = metres * view.px_per_m;
-    let bar = format!("M{MARGIN_PX} {}v10h{length_px}v-10", y - 9.0);
-    let mut group = Group::new()
-        .add(Path::new().set("d", bar).set("stroke", INK).set("stroke-width", 2).set("fill", "none"))
-        .add(label(MARGIN_PX + length_px + 10.0, y + 2.0, 15, format!("{metres} m")));
     let mut entries = vec![
         ("start", START, 0.0, "", 62.0),
         ("path", PATH, 2.2, "", 62.0),
@@ -316,8 +325,23 @@ fn footer(scene: &Scene<'_>, view: &View) -> Group {
     if !scene.reference.is_empty() {
         entries.push(("reference", START, 1.6, "", 80.0));
     }
+    legend(&entries, view)
+}
+
+/// Name, colour, width (zero for a dot), dashes, and the width of the name in pixels.
+pub(super) type Entry = (&'static str, &'static str, f32, &'static str, f32);
+
+/// Scale bar and legend.
+pub(super) fn legend(entries: &[Entry], view: &View) -> Group {
+    let y = view.height_px - 24.0;
+    let metres = scale_step(view);
+    let length_px = metres * view.px_per_m;
+    let bar = format!("M{MARGIN_PX} {}v10h{length_px}v-10", y - 9.0);
+    let mut group = Group::new()
+        .add(Path::new().set("d", bar).set("stroke", INK).set("stroke-width", 2).set("fill", "none"))
+        .add(label(MARGIN_PX + length_px + 10.0, y + 2.0, 15, format!("{metres} m")));
     let mut x = view.width_px - MARGIN_PX - entries.iter().map(|e| e.4 + 32.0).sum::<f32>() + 14.0;
-    for (name, colour, width, dashes, text_px) in entries {
+    for &(name, colour, width, dashes, text_px) in entries {
         group = if width > 0.0 {
             let key = Line::new().set("x1", x).set("x2", x + 26.0).set("y1", y - 4.0).set("y2", y - 4.0);
             let key = key.set("stroke", colour).set("stroke-width", width).set("stroke-linecap", "round");
