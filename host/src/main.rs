@@ -360,7 +360,7 @@ fn results(
         ("trajectory.tum", tum::render(replay::trajectory(&result.steps)).into_bytes()),
         ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),
         ("map.csv", csv::render(&result.map).context("map.csv")?),
-        ("map.svg", svg::render(result, scene).into_bytes()),
+        ("map.svg", svg::render(&result.into(), scene).into_bytes()),
         ("map.pgm", grid.pgm),
         ("map.yaml", grid.yaml.into_bytes()),
         ("report.json", report.render().context("report.json")?),

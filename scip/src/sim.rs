@@ -200,7 +200,7 @@ impl SimulatedUrg {
         if self.faults.deaf || now_us < self.deaf_until_us {
             return;
         }
-        let byte = if baud_rate == self.rate { byte } else { self.rng.next_u32() as u8 | 0x80 };
+        let byte = if rates_agree(baud_rate, self.rate) { byte } else { self.rng.next_u32() as u8 | 0x80 };
         match byte {
             b'\n' | b'\r' => {
                 let line = core::mem::take(&mut self.heard);
@@ -570,6 +570,11 @@ impl SimulatedUrg {
         let drift = us / 1_000_000 * i64::from(self.faults.drift_ppm);
         (us + drift).div_euclid(1000) as u32 & 0xFF_FFFF
     }
+}
+
+/// Whether two ends of a line with these bit rates understand each other: within 2 %, as dividers of a clock are.
+pub fn rates_agree(one: u32, other: u32) -> bool {
+    u64::from(one.abs_diff(other)) * 50 < u64::from(other)
 }
 
 /// Whether the sensor has these steps.

@@ -63,17 +63,28 @@ pub(crate) struct Measurement {
 impl Joint {
     /// A pose known for certain, and odometry errors with these standard deviations.
     pub fn new(sigma_odometry: Vector3<f32>) -> Self {
-        let mut joint = Self {
+        let mut joint = Self::blank();
+        joint.prepare(sigma_odometry);
+        joint
+    }
+
+    /// Sure of everything. Inlined, so that it is built in its place.
+    #[inline(always)]
+    pub(crate) fn blank() -> Self {
+        Self {
             covariance: [0.0; PACKED],
             owners: [None; LINES],
             bias: OdometryBias::default(),
             ages_scans: [f32::INFINITY; LINES],
             shift: [0.0; STATES],
-        };
-        for (i, sigma) in sigma_odometry.iter().enumerate() {
-            joint.set(ODOMETRY + i, ODOMETRY + i, sigma * sigma);
         }
-        joint
+    }
+
+    /// As unsure of the odometry's errors as these standard deviations say.
+    pub(crate) fn prepare(&mut self, sigma_odometry: Vector3<f32>) {
+        for (i, sigma) in sigma_odometry.iter().enumerate() {
+            self.set(ODOMETRY + i, ODOMETRY + i, sigma * sigma);
+        }
     }
 
     /// The odometry's errors as known so far.

@@ -26,7 +26,7 @@
 //! Times are those of the middle beam of a scan.
 //!
 //! # Reading order
-//! [`slam`] for the whole, [`segment`] for what a line is, then the stages in the order of the drawing. [`config`] has
+//! [`mapper`] for what a firmware holds, [`slam`] for the whole, [`segment`] for what a line is, then the stages in the order of the drawing. [`config`] has
 //! every constant and where it comes from.
 //!
 //! # Example
@@ -77,6 +77,7 @@ pub mod extraction;
 pub mod joint;
 pub mod loop_closure;
 pub mod map;
+pub mod mapper;
 pub mod math;
 pub mod odometry;
 pub mod odometry_bias;
@@ -91,6 +92,7 @@ pub mod visibility;
 
 pub use config::{ConfigError, SlamConfig};
 pub use map::{MapSegment, SegmentMap};
+pub use mapper::{Mapper, WheelTicks};
 pub use odometry_track::{OdometryTrack, ScanMotion};
 pub use scan::Scan;
 pub use segment::Segment;

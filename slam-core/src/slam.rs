@@ -1,6 +1,8 @@
 //! The only stateful wiring: a scan and a motion go in, a pose and a map come out.
 
 use heapless::Vec;
+use core::mem::MaybeUninit;
+
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 use crate::association::{AssociationConfig, Pair, View, associate};
@@ -15,6 +17,7 @@ use crate::joint::Joint;
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, SegmentMap};
 use crate::math::{sqrt, wrap_angle};
+use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
 use crate::pose::{components, is_finite, pose, rotate_covariance};
@@ -61,6 +64,8 @@ pub struct Counters {
     pub without_segments: u32,
     /// Scans that left the pose to the odometry: no pair, or a system that could not be solved.
     pub uncorrected: u32,
+    /// Moves by odometry alone, without a scan.
+    pub coasted: u32,
     /// Loops closed.
     pub loops_closed: u32,
     /// Segments that one scan had too many.
@@ -125,12 +130,33 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// An empty map, with the robot at its origin.
     pub fn new(config: SlamConfig) -> Result<Self, ConfigError> {
+        Self::check(&config)?;
+        let mut slam = Self::blank(config);
+        slam.prepare();
+        Ok(slam)
+    }
+
+    /// The same, made where it is to stay: no copy of it passes over the stack.
+    pub fn new_in(place: &mut MaybeUninit<Self>, config: SlamConfig) -> Result<&mut Self, ConfigError> {
+        Self::check(&config)?;
+        let slam = place.write(Self::blank(config));
+        slam.prepare();
+        Ok(slam)
+    }
+
+    pub(crate) fn check(config: &SlamConfig) -> Result<(), ConfigError> {
         config.validate()?;
         let beams = config.sensor.geometry.beams();
         if beams > BEAMS {
             return Err(ConfigError::TooManyBeams { beams, capacity: BEAMS });
         }
-        let mut slam = Self {
+        Ok(())
+    }
+
+    /// Before [`Self::prepare`]. Inlined, so that it is built in its place.
+    #[inline(always)]
+    pub(crate) fn blank(config: SlamConfig) -> Self {
+        Self {
             config,
             map: SegmentMap::new(),
             map_from_base: Isometry2::identity(),
@@ -138,16 +164,22 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             counters: Counters::default(),
             way_m: 0.0,
             closing: PendingClosure::default(),
-            joint: matches!(config.registration, RegistrationConfig::Joint(_))
-                .then(|| Joint::new(config.odometry.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas()))),
+            joint: None,
             bearings: Vec::new(),
             points: Vec::new(),
             observed: Vec::new(),
             pairs: Vec::new(),
             candidates: Vec::new(),
-        };
-        fill_bearings(&slam.config.sensor, &mut slam.bearings);
-        Ok(slam)
+        }
+    }
+
+    /// What depends on the configuration.
+    pub(crate) fn prepare(&mut self) {
+        if matches!(self.config.registration, RegistrationConfig::Joint(_)) {
+            let sigmas = self.config.odometry.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas());
+            self.joint.insert(Joint::blank()).prepare(sigmas);
+        }
+        fill_bearings(&self.config.sensor, &mut self.bearings);
     }
 
     /// The settings.
@@ -230,6 +262,23 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.local_covariance = update.covariance;
         update.covariance = self.covariance();
         update
+    }
+
+    /// Moves the robot by odometry alone, where no scan has come.
+    pub fn coast(&mut self, motion: &Increment) -> Isometry2<f32> {
+        let prior = self.predict(&ScanMotion::instantaneous(*motion));
+        self.map_from_base = prior.pose;
+        self.local_covariance = prior.covariance;
+        self.counters.coasted = self.counters.coasted.saturating_add(1);
+        prior.pose
+    }
+
+    /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.
+    pub fn loosen(&mut self, by: &Matrix3<f32>) {
+        self.local_covariance += by;
+        if let Some(joint) = &mut self.joint {
+            joint.loosen_pose(by, &mut self.map);
+        }
     }
 
     /// Eq. (1) with covariance: where the odometry says the base is.

@@ -23,7 +23,7 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
         drive.truth.iter().map(|pose| nalgebra::convert_unchecked(map_from_world * pose)).collect();
     let title = format!("{}, seed {seed}", world.name);
     let draw = |replay: &Replay, subtitle: &str| {
-        svg::render(replay, &Scene { title: &title, subtitle, blueprint: &blueprint, reference: &truth })
+        svg::render(&replay.into(), &Scene { title: &title, subtitle, blueprint: &blueprint, reference: &truth })
     };
     let mut figures = vec![(format!("{}.svg", world.name), draw(&replay, "default configuration"))];
     if world.name == "hall" {
@@ -47,7 +47,7 @@ pub fn recorded(name: &str, log: &Log, replay: &Replay, reference: &[StampedPosi
     let title = format!("{name} ({})", log.format);
     let scene =
         Scene { title: &title, subtitle: "default configuration", reference: &reference, ..Scene::default() };
-    (format!("{name}.svg"), svg::render(replay, &scene))
+    (format!("{name}.svg"), svg::render(&replay.into(), &scene))
 }
 
 /// The same scans where the wheels say they were taken, without a map.

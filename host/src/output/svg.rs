@@ -47,6 +47,34 @@ pub struct Scene<'a> {
     pub reference: &'a [Isometry2<f32>],
 }
 
+/// What was mapped and driven, in `map`.
+#[derive(Default)]
+pub struct Picture<'a> {
+    /// The map.
+    pub map: &'a [MapSegment],
+    /// The path, scan by scan.
+    pub path: Vec<Isometry2<f32>>,
+    /// The same by dead reckoning.
+    pub odometry: Vec<Isometry2<f32>>,
+    /// Points of all scans.
+    pub points: Vec<Point2<f32>>,
+    /// Way driven, metres.
+    pub distance_m: f64,
+}
+
+impl<'a> From<&'a Replay> for Picture<'a> {
+    fn from(replay: &'a Replay) -> Self {
+        let points = replay.steps.iter().flat_map(|s| s.points.iter().map(|p| s.pose_in_final_map * p));
+        Self {
+            map: &replay.map,
+            path: replay.steps.iter().map(|s| s.pose_in_final_map).collect(),
+            odometry: replay.steps.iter().map(|s| s.odometry).collect(),
+            points: points.collect(),
+            distance_m: replay.distance_m,
+        }
+    }
+}
+
 /// Where `map` lies on the paper.
 pub(super) struct View {
     low: Point2<f32>,
@@ -58,17 +86,17 @@ pub(super) struct View {
 }
 
 impl View {
-    fn around(replay: &Replay, scene: &Scene<'_>) -> Self {
+    fn around(picture: &Picture<'_>, scene: &Scene<'_>) -> Self {
         let mut points: Vec<Point2<f32>> = Vec::new();
         points.extend(
-            replay
+            picture
                 .map
                 .iter()
                 .filter(|s| s.hits >= ESTABLISHED_HITS)
                 .flat_map(|s| [s.segment.start, s.segment.end]),
         );
         points.extend(scene.blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
-        points.extend(replay.steps.iter().map(|s| Point2::from(s.pose_in_final_map.translation.vector)));
+        points.extend(picture.path.iter().map(|pose| Point2::from(pose.translation.vector)));
         Self::of(points.into_iter())
     }
 
@@ -109,17 +137,17 @@ impl View {
 }
 
 /// Renders the drawing, over the blueprint where there is one.
-pub fn render(replay: &Replay, scene: &Scene<'_>) -> String {
-    let view = View::around(replay, scene);
+pub fn render(picture: &Picture<'_>, scene: &Scene<'_>) -> String {
+    let view = View::around(picture, scene);
     let document = view
         .sheet()
         .add(blueprint_lines(scene.blueprint, &view))
-        .add(scan_points(replay, &view))
-        .add(dead_reckoning(replay, &view))
-        .add(walls(&replay.map, &view))
+        .add(scan_points(&picture.points, &view))
+        .add(dead_reckoning(&picture.odometry, &view))
+        .add(walls(picture.map, &view))
         .add(reference_path(scene.reference, &view))
-        .add(path(replay, &view))
-        .add(header(replay, scene, &view))
+        .add(path(&picture.path, &view))
+        .add(header(picture, scene, &view))
         .add(footer(scene, &view));
     format!("{document}\n")
 }
@@ -155,17 +183,14 @@ fn blueprint_lines(blueprint: &[Edge], view: &View) -> Path {
     path.set("stroke-linecap", "round").set("fill", "none")
 }
 
-fn scan_points(replay: &Replay, view: &View) -> Path {
+fn scan_points(points: &[Point2<f32>], view: &View) -> Path {
     let mut cells = HashSet::new();
     let mut d = String::new();
-    for step in &replay.steps {
-        for point in &step.points {
-            let p = step.pose_in_final_map * point;
-            let cell = ((p.x / POINT_CELL_M).floor() as i32, (p.y / POINT_CELL_M).floor() as i32);
-            if view.holds(p) && cells.insert(cell) {
-                let (x, y) = view.px(p);
-                let _ = write!(d, "M{x} {y}h0");
-            }
+    for p in points {
+        let cell = ((p.x / POINT_CELL_M).floor() as i32, (p.y / POINT_CELL_M).floor() as i32);
+        if view.holds(*p) && cells.insert(cell) {
+            let (x, y) = view.px(*p);
+            let _ = write!(d, "M{x} {y}h0");
         }
     }
     let size = (0.03 * view.px_per_m).clamp(0.7, 2.2);
@@ -228,9 +253,9 @@ fn reference_path(reference: &[Isometry2<f32>], view: &View) -> Path {
     path.set("stroke-width", 1.6).set("stroke-linejoin", "round").set("fill", "none")
 }
 
-fn dead_reckoning(replay: &Replay, view: &View) -> Path {
+fn dead_reckoning(odometry: &[Isometry2<f32>], view: &View) -> Path {
     Path::new()
-        .set("d", polyline(replay.steps.iter().map(|s| &s.odometry), view))
+        .set("d", polyline(odometry.iter(), view))
         .set("stroke", ODOMETRY)
         .set("stroke-width", 2)
         .set("stroke-dasharray", "7 5")
@@ -238,8 +263,8 @@ fn dead_reckoning(replay: &Replay, view: &View) -> Path {
         .set("fill", "none")
 }
 
-fn path(replay: &Replay, view: &View) -> Group {
-    let poses = || replay.steps.iter().map(|s| &s.pose_in_final_map);
+fn path(path: &[Isometry2<f32>], view: &View) -> Group {
+    let poses = || path.iter();
     let line = Path::new()
         .set("d", polyline(poses(), view))
         .set("stroke", PATH)
@@ -286,13 +311,13 @@ fn label(x: f32, y: f32, size: u32, text: impl Into<String>) -> Text {
     Text::new(text).set("x", x).set("y", y).set("font-size", size).set("fill", INK)
 }
 
-fn header(replay: &Replay, scene: &Scene<'_>, view: &View) -> Group {
+fn header(picture: &Picture<'_>, scene: &Scene<'_>, view: &View) -> Group {
     let facts = format!(
         "{} · {} scans · {:.0} m driven · {} segments",
         scene.subtitle,
-        replay.steps.len(),
-        replay.distance_m,
-        replay.map.len(),
+        picture.path.len(),
+        picture.distance_m,
+        picture.map.len(),
     );
     heading(scene.title, &facts, view)
 }

@@ -108,8 +108,7 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
     let all_nees: Vec<f64> = (0..off.len()).filter_map(nees).collect();
     let last = off.len().saturating_sub(1);
     let map = map_in_world(drive, &replay.map);
-    let found: Vec<f64> =
-        world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), drive, &map)).collect();
+    let found = corner_errors(world, drive, &replay.map);
     let (edges, discs) = (world.edges(), world.discs());
     let established: Vec<&Segment> =
         map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
@@ -128,6 +127,12 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
         established_segments: established.len(),
         spurious_segments: established.iter().filter(|s| is_spurious(s, &edges, &discs)).count(),
     }
+}
+
+/// Equation (11), corner by corner, of those that the map has; metres, no alignment.
+pub fn corner_errors(world: &World, drive: &Drive, map: &[MapSegment]) -> Vec<f64> {
+    let map = map_in_world(drive, map);
+    world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), drive, &map)).collect()
 }
 
 /// The map's segments in the blueprint's frame.

@@ -175,10 +175,9 @@ pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result
     robot.apply(&mut config, robot.beams().unwrap_or(682), None);
     let geometry = config.sensor.geometry;
     let base_from_laser: Isometry2<f64> = nalgebra::convert(config.sensor.mounting.base_from_laser);
-    // A stream for each source of noise, so that one does not move another.
-    let stream = |k: u128| Pcg64::new(u128::from(seed).wrapping_mul(0x9E37_79B9_7F4A_7C15) + 1, k);
-    let mut base = Base::new(&world.path, wheels, &sim.wheel, stream(1));
-    let mut scanner = Scanner::new(world, sim.sensor, geometry, stream(2));
+    let [base_rng, scanner_rng] = streams(seed);
+    let mut base = Base::new(&world.path, wheels, &sim.wheel, base_rng);
+    let mut scanner = Scanner::new(world, sim.sensor, geometry, scanner_rng);
 
     // Poses and ticks at every step so far.
     let mut poses = vec![base.pose];
@@ -224,8 +223,13 @@ pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result
     Ok(drive)
 }
 
+/// Random numbers for the base and for the scanner: a stream for each, so that one does not move the other.
+pub fn streams(seed: u64) -> [Pcg64; 2] {
+    [1, 2].map(|k| Pcg64::new(u128::from(seed).wrapping_mul(0x9E37_79B9_7F4A_7C15) + 1, k))
+}
+
 /// The pose at a fraction of a step.
-fn interpolate(poses: &[Isometry2<f64>], step: f64) -> Isometry2<f64> {
+pub fn interpolate(poses: &[Isometry2<f64>], step: f64) -> Isometry2<f64> {
     let index = (step.max(0.0) as usize).min(poses.len().saturating_sub(2));
     poses[index].lerp_slerp(&poses[index + 1], (step - index as f64).clamp(0.0, 1.0))
 }

@@ -1,0 +1,78 @@
+//! Memory of the board, linker arguments, and the robot file as constants.
+
+use std::path::{Path, PathBuf};
+use std::{env, fs};
+
+use lineslam::robot::Robot;
+use slam_core::SlamConfig;
+use slam_core::pose::components;
+
+fn main() {
+    println!("cargo::rerun-if-changed=build.rs");
+    if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os != "none") {
+        return;
+    }
+    let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
+    let memory = "memory.x";
+    println!("cargo::rerun-if-changed={memory}");
+    fs::copy(memory, out.join("memory.x")).expect("memory.x can be copied");
+    println!("cargo::rustc-link-search={}", out.display());
+    // Here and not in the configuration, where RUSTFLAGS would replace them.
+    for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {
+        println!("cargo::rustc-link-arg-bins={argument}");
+    }
+    println!("cargo::rerun-if-env-changed=LINESLAM_ROBOT");
+    let robot = env::var("LINESLAM_ROBOT").unwrap_or_else(|_| "robots/paper.toml".into());
+    println!("cargo::rerun-if-changed={robot}");
+    fs::write(out.join("robot.rs"), constants(Path::new(&robot))).expect("robot.rs can be written");
+}
+
+/// What the firmware must know of the robot. A file that cannot be used ends the build with its error.
+fn constants(path: &Path) -> String {
+    let robot = match Robot::load(path) {
+        Ok(robot) => robot,
+        Err(error) => {
+            println!("cargo::error=LINESLAM_ROBOT={}: {error}", path.display());
+            std::process::exit(1);
+        }
+    };
+    let (Some(drive), Some(beams)) = (robot.drive(), robot.beams()) else {
+        println!("cargo::error=LINESLAM_ROBOT={}: [wheels] and [sensor.steps] are needed", path.display());
+        std::process::exit(1);
+    };
+    let mut config = SlamConfig::default();
+    robot.apply(&mut config, beams, None);
+    let (noise, sensor) = (config.odometry.noise, config.sensor);
+    let mounting = components(&sensor.mounting.base_from_laser);
+    format!(
+        "/// Name of the robot file's robot.\n\
+         pub const NAME: &str = {:?};\n\
+         /// Its wheels.\n\
+         pub const DRIVE: slam_core::odometry::DifferentialDrive = slam_core::odometry::{drive:?};\n",
+        robot.name,
+    ) + &format!(
+        "/// Puts sensor, mounting and odometry into a configuration.\n\
+         pub fn apply(config: &mut slam_core::SlamConfig) {{\n\
+         use slam_core::odometry::*;\n\
+         use slam_core::scan::*;\n\
+         config.odometry.noise = {noise:?};\n\
+         config.line_noise.sigma_offset_m = {:?};\n\
+         config.sensor.geometry = {:?};\n\
+         config.sensor.used_steps = {:?};\n\
+         config.sensor.codes = {:?};\n\
+         config.sensor.noise = {:?};\n\
+         config.sensor.mounting = Mounting {{\n\
+             base_from_laser: slam_core::pose::pose({:?}, {:?}, {:?}),\n\
+             upside_down: {:?},\n\
+         }};\n}}\n",
+        config.line_noise.sigma_offset_m,
+        sensor.geometry,
+        sensor.used_steps,
+        sensor.codes,
+        sensor.noise,
+        mounting.x,
+        mounting.y,
+        mounting.z,
+        sensor.mounting.upside_down,
+    )
+}

@@ -1,0 +1,198 @@
+//! The NUCLEO-F429ZI as the emulator builds it: the part, its crystal's clock, its supply, and what hangs on its pins.
+
+use std::num::{NonZeroU32, NonZeroU64};
+use std::sync::{Arc, Mutex};
+
+use rigless::chip::Timeline;
+use rigless::chip::uart::Peer;
+use rigless::cpu::armv7m::windows;
+use rigless::device::Level;
+use rigless::machine::{Board, Crystal, Supply, Target, armv7m};
+use rigless::mcu::{Mcu, Operate};
+use rigless::snapshot::Store;
+use rigless::soc::Error;
+use rigless::soc::stm32f427::Stm32f427;
+use rigless::soc::stm32f427::generated::tim2::Register as Tim2;
+use rigless::soc::stm32f427::peripherals::gpio::Pin;
+use rigless::time::VirtualNanos;
+
+use crate::room::Room;
+
+/// What the simulation and the chips on the board share.
+pub type Shared = Arc<Mutex<Room>>;
+
+const CLOCK_HZ: NonZeroU64 = NonZeroU64::new(180_000_000).expect("not zero");
+/// A Cortex-M4F retires an instruction in about 1.25 cycles of code like this, with the flash accelerator on: an
+/// assumption, stated and not measured here.
+const INSTRUCTIONS_PER_SECOND: NonZeroU64 = NonZeroU64::new(144_000_000).expect("not zero");
+const REFCLK_DIVIDER: NonZeroU32 = NonZeroU32::new(8).expect("not zero");
+
+/// USART6 among the part's serial ports, USART3 beside it.
+const URG_PORT: usize = 3;
+const CONSOLE_PORT: usize = 2;
+/// TIM2, TIM3 and TIM4 among the part's timers.
+const TIME_DRIVER: usize = 0;
+const RIGHT: usize = 1;
+const LEFT: usize = 2;
+/// Ports B and C.
+const LED: (usize, u8) = (1, 0);
+const BUTTON: (usize, u8) = (2, 13);
+
+/// `EGR` of TIM2, where the time driver asks for an update.
+pub const TIME_DRIVER_EGR: u64 = 0x4000_0014;
+/// `BRR` of USART6.
+pub const URG_BRR: u64 = 0x4001_1408;
+
+/// The board.
+#[derive(Debug)]
+pub struct Nucleo {
+    /// The microcontroller: an STM32F427, which has all that the firmware uses of the STM32F429.
+    pub mcu: Stm32f427,
+    shared: Shared,
+}
+
+impl Nucleo {
+    /// Powered and wired, not yet running.
+    pub fn new(shared: Shared) -> Result<Self, Error> {
+        let mut board = Self { mcu: Stm32f427::new()?, shared: shared.clone() };
+        board.mcu.rcc.attach_crystals(8_000_000, Crystal::NONE.0);
+        board.mcu.set_supply(Supply(3300).0);
+        board.mcu.usart[URG_PORT].attach(Urg { shared: shared.clone() });
+        board.mcu.usart[CONSOLE_PORT].attach(Console { shared });
+        Ok(board)
+    }
+
+    /// Garbles so many in a million of the bytes that arrive: noise, and framing errors.
+    pub fn set_line_errors(&mut self, noise: u32, framing: u32, seed: u64) {
+        let errors = self.mcu.usart[URG_PORT].errors_mut();
+        errors.seed = seed;
+        (errors.noise.name, errors.noise.per_million) = ("urg.noise", noise);
+        (errors.framing.name, errors.framing.per_million) = ("urg.framing", framing);
+    }
+
+    /// Levels of an encoder's two lines, for the left and the right wheel.
+    pub fn drive_encoder(&mut self, at: VirtualNanos, side: usize, [a, b]: [Level; 2]) {
+        use rigless::soc::stm32f427::peripherals::tim::Channel;
+        let timer = if side == 0 { LEFT } else { RIGHT };
+        self.mcu.drive_timer(at, timer, |tim, registers, context| {
+            for (number, level) in [(1, a), (2, b)] {
+                if let Some(channel) = Channel::new(number) {
+                    tim.drive_input(channel, level, registers, context);
+                }
+            }
+        });
+    }
+
+    /// Presses or releases the user button.
+    pub fn press(&mut self, at: VirtualNanos, pressed: bool) {
+        let level = if pressed { Level::High } else { Level::Low };
+        let Some(pin) = Pin::new(BUTTON.1) else { return };
+        self.mcu.drive_port(at, BUTTON.0, |port, registers, context| {
+            port.drive(pin, Some(level), registers, context);
+        });
+    }
+
+    /// Whether the LED is lit.
+    pub fn led(&mut self) -> bool {
+        let Some(pin) = Pin::new(LED.1) else { return false };
+        let (port, registers) = self.mcu.port(LED.0);
+        port.level(pin, registers) == Level::High
+    }
+
+    /// The bit rate that a divider written to USART6 makes.
+    pub fn urg_baud_rate(&mut self, divider: u64) -> u32 {
+        let (rcc, registers) = self.mcu.clocks();
+        let clock_hz = rcc.pclk2(registers);
+        (clock_hz / divider.max(1)) as u32
+    }
+
+    /// Undoes what the timer's model does and the silicon does not: an update by software with the counter standing at
+    /// a compare value raises the compare flag. The time driver's period count would begin half a period ahead.
+    pub fn clear_time_driver_flags(&mut self) {
+        let (_, registers) = self.mcu.timer(TIME_DRIVER);
+        registers.set(Tim2::Sr, 0);
+    }
+}
+
+impl Store for Nucleo {}
+
+impl Board for Nucleo {
+    fn name(&self) -> &'static str {
+        "nucleo-f429zi"
+    }
+
+    fn target_names(&self) -> Vec<&'static str> {
+        vec!["stm32f429zi"]
+    }
+
+    fn mcu(&mut self, target: usize) -> Option<&mut dyn Mcu> {
+        (target == 0).then_some(&mut self.mcu)
+    }
+
+    fn targets(&mut self) -> Vec<Target<'_>> {
+        let lines = NonZeroU32::new(u32::from(Operate::cpu(&self.mcu).interrupt_lines));
+        let core = armv7m::Core {
+            variant: armv7m::Variant::M4,
+            clock_hz: CLOCK_HZ,
+            interrupt_lines: lines.expect("the part has interrupts"),
+            priority_bits: 4,
+            refclk_divider: REFCLK_DIVIDER,
+            instructions_per_second: INSTRUCTIONS_PER_SECOND,
+            boot: "flash",
+        };
+        let core = core.spec_with_parts(
+            &windows(Mcu::bus(&self.mcu)),
+            armv7m::Fpu::FpV4Sp,
+            armv7m::MpuRegions::Eight,
+        );
+        vec![Target::new("stm32f429zi", &mut self.mcu, core)]
+    }
+}
+
+/// The sensor on USART6.
+#[derive(Debug)]
+struct Urg {
+    shared: Shared,
+}
+
+impl Store for Urg {}
+
+impl Peer for Urg {
+    fn receive(&mut self, word: u16, context: &mut Timeline<'_, '_>) {
+        let now_us = context.now().0 / 1000;
+        if let Ok(mut room) = self.shared.lock() {
+            room.to_sensor(word as u8, now_us);
+        }
+    }
+
+    fn transmit(&mut self, now: VirtualNanos) -> Option<u16> {
+        self.shared.lock().ok()?.from_sensor(now.0 / 1000).map(u16::from)
+    }
+}
+
+/// Whoever listens to the virtual COM port.
+#[derive(Debug)]
+struct Console {
+    shared: Shared,
+}
+
+impl Store for Console {}
+
+impl Peer for Console {
+    fn receive(&mut self, word: u16, _: &mut Timeline<'_, '_>) {
+        if let Ok(mut room) = self.shared.lock() {
+            room.console.push(word as u8);
+        }
+    }
+
+    fn transmit(&mut self, _: VirtualNanos) -> Option<u16> {
+        None
+    }
+}
+
+impl Nucleo {
+    /// What the simulation and the board share.
+    pub fn shared(&self) -> &Shared {
+        &self.shared
+    }
+}

@@ -1,0 +1,184 @@
+//! `cargo xtask emulate` runs this.
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::Parser;
+use comfy_table::{Table, presets};
+use emulator::fault::Fault;
+use emulator::report::{self, Judged};
+use emulator::run::{Outcome, Plan, Progress, run};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use lineslam::output::svg::{self, Picture, Scene};
+use lineslam::output::{self, csv, tum};
+use lineslam::robot::Robot;
+use lineslam::sim::world::World;
+use lineslam::sim::{SimConfig, judge};
+
+/// Runs the firmware on an emulated board in a simulated building.
+#[derive(Parser)]
+#[command(bin_name = "cargo xtask emulate")]
+struct Cli {
+    /// The firmware.
+    #[arg(long, value_name = "ELF")]
+    firmware: PathBuf,
+    /// World: a name in worlds/, or a file.
+    #[arg(long, default_value = "hall")]
+    world: String,
+    /// Robot file that the firmware was built for.
+    #[arg(long, value_name = "FILE", default_value = "robots/paper.toml")]
+    robot: PathBuf,
+    /// Seed of all noise.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Ends the run after so many seconds of virtual time, if the path has not ended before.
+    #[arg(long, value_name = "N")]
+    seconds: Option<u64>,
+    /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.dat, log.txt, console.tum and report.json.
+    #[arg(long, value_name = "FOLDER", default_value = "out")]
+    out: PathBuf,
+    /// What goes wrong: unplug@S+S, garble=N, line=N, streaming=BIT/S, reset@S, stamp-wrap. May be given again.
+    #[arg(long = "fault", value_name = "FAULT")]
+    faults: Vec<Fault>,
+    /// Change an error of the simulated robot, as in `lineslam simulate`.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Print the firmware's log as it comes.
+    #[arg(long)]
+    log: bool,
+}
+
+fn main() -> ExitCode {
+    match emulate(&Cli::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn emulate(cli: &Cli) -> anyhow::Result<()> {
+    let file = PathBuf::from(&cli.world);
+    let file = if file.exists() { file } else { Path::new("worlds").join(format!("{}.toml", cli.world)) };
+    let world = World::load(&file)?;
+    let robot = Robot::load(&cli.robot)?;
+    let mut sim = SimConfig::default();
+    for setting in &cli.settings {
+        sim.set(setting)?;
+    }
+    let plan = Plan {
+        elf: &cli.firmware,
+        world: &world,
+        robot: &robot,
+        sim,
+        seed: cli.seed,
+        seconds: cli.seconds,
+        faults: cli.faults.clone(),
+    };
+    let bar = progress_bar();
+    let shown = bar.clone();
+    let outcome = run(&plan, move |p: Progress| {
+        shown.set_position(p.now_us / 1_000_000);
+        shown.set_message(format!(
+            "{:.3} m off, {} segments, {:.2} ms a scan",
+            p.error_m,
+            p.segments,
+            f64::from(p.took_us) * 1e-3
+        ));
+    })?;
+    bar.finish_and_clear();
+    if cli.log {
+        for line in &outcome.log {
+            println!("{line}");
+        }
+    }
+    let judged = report::judge(&world, cli.seed, &outcome)?;
+    let files = files(&world, &robot, &outcome, &judged)?;
+    output::write_all(&cli.out, &files)?;
+    print_summary(&judged, &outcome, &cli.out);
+    Ok(())
+}
+
+fn files(
+    world: &World,
+    robot: &Robot,
+    outcome: &Outcome,
+    judged: &Judged,
+) -> anyhow::Result<Vec<(&'static str, Vec<u8>)>> {
+    let stamps = || judged.drive.log.scans.iter().map(|s| s.stamp_us);
+    let picture = Picture {
+        map: &judged.map,
+        path: judged.poses.clone(),
+        odometry: report::dead_reckoning(outcome, robot),
+        points: report::points(judged, robot),
+        distance_m: judged
+            .drive
+            .truth
+            .windows(2)
+            .map(|p| (p[1].translation.vector - p[0].translation.vector).norm())
+            .sum(),
+    };
+    let blueprint = judge::blueprint_in_map(world, &judged.drive);
+    let title = format!("{}, seed {}", judged.report.world, judged.report.seed);
+    let scene = Scene {
+        title: &title,
+        subtitle: "mapped by the firmware on the emulated board",
+        blueprint: &blueprint,
+        ..Scene::default()
+    };
+    let log: String = outcome.log.iter().map(|line| format!("{line}\n")).collect();
+    let mut report = serde_json::to_vec_pretty(&judged.report).context("report.json")?;
+    report.push(b'\n');
+    Ok(vec![
+        ("trajectory.tum", tum::render(stamps().zip(&judged.poses)).into_bytes()),
+        ("truth.tum", tum::render_f64(stamps().zip(&judged.drive.truth)).into_bytes()),
+        ("map.csv", csv::render(&judged.map).context("map.csv")?),
+        ("map.svg", svg::render(&picture, &scene).into_bytes()),
+        ("log.dat", report::log_text(judged).into_bytes()),
+        ("log.txt", log.into_bytes()),
+        ("console.tum", outcome.console.clone().into_bytes()),
+        ("report.json", report),
+    ])
+}
+
+fn progress_bar() -> ProgressBar {
+    let style = ProgressStyle::with_template("{spinner:.cyan} {pos} s of virtual time, {msg}  ({elapsed})")
+        .expect("the template is a constant");
+    let target = if std::io::stderr().is_terminal() {
+        ProgressDrawTarget::stderr()
+    } else {
+        ProgressDrawTarget::hidden()
+    };
+    ProgressBar::with_draw_target(None, target).with_style(style)
+}
+
+fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
+    let r = &judged.report;
+    let corners = match r.corner_error_m {
+        Some(error_m) => format!("{error_m:.3} m, {} of {} found", r.corners_found, r.corners),
+        None => format!("none of {} found", r.corners),
+    };
+    let [median, p99, max] = r.update_us.map(|us| f64::from(us) * 1e-3);
+    let rows = [
+        ("world", format!("{}, seed {}", r.world, r.seed)),
+        ("driven", format!("{:.0} s of virtual time{}", r.virtual_s, if r.arrived { "" } else { ", not to the end" })),
+        ("scans", format!("{} sent, {} used", r.scans_sent, r.scans_used)),
+        ("corner error, eq. (11)", corners),
+        ("trajectory error, rmse", format!("{:.3} m, at worst {:.3} m", r.trajectory.ate_rmse_m, r.worst_position_error_m)),
+        ("map", format!("{} segments", r.segments)),
+        ("a scan on the microcontroller", format!("median {median:.2} ms, p99 {p99:.2} ms, max {max:.2} ms")),
+        ("of the processor's time", format!("{:.1} %", 100.0 * r.cpu_share)),
+        ("resets, warnings", format!("{}, {}", r.resets, r.warnings)),
+        ("instructions", format!("{:.0} million", outcome.instructions as f64 * 1e-6)),
+        ("written to", out.display().to_string()),
+    ];
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    for (name, value) in rows {
+        table.add_row([name.to_owned(), value]);
+    }
+    println!("{table}");
+}

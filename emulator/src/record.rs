@@ -1,0 +1,132 @@
+//! The firmware's own record of what it did, read from its memory (`src/trace.rs` writes it).
+
+use nalgebra::{Isometry2, Vector3};
+use rigless::emulator::Host;
+use rigless::soc::Width;
+use slam_core::WheelTicks;
+use slam_core::pose::pose;
+
+/// The layout that is understood.
+const LAYOUT: u64 = 1;
+/// Samples in the record's ring.
+const RING: u64 = 64;
+
+/// What was done to the map.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Event {
+    /// A kept map was taken up.
+    Resumed,
+    /// A scan was taken in.
+    Scan {
+        /// Its middle beam on the firmware's clock.
+        middle_us: u64,
+        /// Its ranges.
+        ranges_mm: Vec<u16>,
+        /// What the work took.
+        took_us: u32,
+    },
+    /// On by odometry alone.
+    Coasted {
+        /// Where it was to end, on the firmware's clock.
+        until_us: u64,
+    },
+}
+
+/// An event with what led to it and what came of it.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// Virtual time at which it was read, at most a millisecond after it happened.
+    pub read_us: u64,
+    /// Samples of the wheels since the entry before.
+    pub samples: Vec<WheelTicks>,
+    /// What was done.
+    pub event: Event,
+    /// x, y, θ after it, as the firmware has them.
+    pub pose: Vector3<f32>,
+    /// Standard deviations of them.
+    pub sigmas: Vector3<f32>,
+    /// Segments of the map.
+    pub segments: u32,
+}
+
+impl Entry {
+    /// The pose as a transform.
+    pub fn map_from_base(&self) -> Isometry2<f32> {
+        pose(self.pose.x, self.pose.y, self.pose.z)
+    }
+}
+
+/// Reads the record as it grows.
+pub struct Recorder {
+    trace: u64,
+    events: u64,
+    samples_taken: u64,
+    /// All so far.
+    pub entries: Vec<Entry>,
+}
+
+impl Recorder {
+    /// Of the record at this address.
+    pub fn new(trace: u64) -> Self {
+        Self { trace, events: 0, samples_taken: 0, entries: Vec::new() }
+    }
+
+    /// The firmware has been reset: its record begins anew.
+    pub fn restarted(&mut self) {
+        (self.events, self.samples_taken) = (0, 0);
+    }
+
+    /// Looks for a new event.
+    pub fn look(&mut self, host: &mut dyn Host, now_us: u64) -> anyhow::Result<bool> {
+        let events = host.read(self.trace + 4, Width::W32)?;
+        if events == self.events {
+            return Ok(false);
+        }
+        anyhow::ensure!(host.read(self.trace, Width::W32)? == LAYOUT, "the firmware's record has another layout");
+        anyhow::ensure!(events == self.events + 1, "{} events at once", events.wrapping_sub(self.events));
+        self.events = events;
+        let kind = host.read(self.trace + 8, Width::W32)?;
+        let taken = host.read(self.trace + 12, Width::W32)?;
+        anyhow::ensure!(taken - self.samples_taken <= RING, "{} samples at once", taken - self.samples_taken);
+        let mut samples = Vec::new();
+        for number in self.samples_taken..taken {
+            let at = self.trace + 16 + number % RING * 16;
+            samples.push(WheelTicks {
+                stamp_us: read_u64(host, at)?,
+                left: host.read(at + 8, Width::W32)? as i32,
+                right: host.read(at + 12, Width::W32)? as i32,
+            });
+        }
+        self.samples_taken = taken;
+        let rest = self.trace + 16 + RING * 16;
+        let at_us = read_u64(host, rest)?;
+        let word = |host: &mut dyn Host, k: u64| host.read(rest + 8 + 4 * k, Width::W32).map(|w| w as u32);
+        let float = |host: &mut dyn Host, k: u64| word(host, k).map(f32::from_bits);
+        let event = match kind {
+            1 => Event::Resumed,
+            2 => {
+                let (from, len) = (u64::from(word(host, 0)?), u64::from(word(host, 1)?));
+                let mut ranges_mm = Vec::new();
+                for k in 0..len {
+                    ranges_mm.push(host.read(from + 2 * k, Width::W16)? as u16);
+                }
+                Event::Scan { middle_us: at_us, ranges_mm, took_us: word(host, 9)? }
+            }
+            3 => Event::Coasted { until_us: at_us },
+            other => anyhow::bail!("an event of kind {other}"),
+        };
+        self.entries.push(Entry {
+            read_us: now_us,
+            samples,
+            event,
+            pose: Vector3::new(float(host, 2)?, float(host, 3)?, float(host, 4)?),
+            sigmas: Vector3::new(float(host, 5)?, float(host, 6)?, float(host, 7)?),
+            segments: word(host, 8)?,
+        });
+        Ok(true)
+    }
+}
+
+fn read_u64(host: &mut dyn Host, at: u64) -> anyhow::Result<u64> {
+    Ok(host.read(at, Width::W32)? | host.read(at + 4, Width::W32)? << 32)
+}

@@ -1,0 +1,194 @@
+//! The world around the board: a building, a base that drives through it, the sensor, and the encoders' edges.
+
+use lineslam::robot::Robot;
+use lineslam::sim::base::Base;
+use lineslam::sim::scanner::Scanner;
+use lineslam::sim::world::World;
+use lineslam::sim::{SimConfig, interpolate, streams};
+use nalgebra::Isometry2;
+use rigless::device::Level;
+use scip::sim::{Faults, Mode, SimulatedUrg, rates_agree};
+use slam_core::SlamConfig;
+
+/// The base is stepped this often, microseconds.
+pub const STEP_US: u64 = 1000;
+/// The base stands until the sensor has been found.
+const PAUSE_S: f64 = 6.0;
+
+/// A scan as the sensor measured it.
+#[derive(Clone, Debug)]
+pub struct TrueScan {
+    /// When its middle beam was taken, virtual microseconds.
+    pub middle_us: u64,
+    /// Where `base` was then, in the world.
+    pub world_from_base: Isometry2<f64>,
+    /// What was sent.
+    pub ranges_mm: Vec<u16>,
+}
+
+/// A change of an encoder's lines.
+#[derive(Clone, Copy, Debug)]
+pub struct Edge {
+    /// When, virtual nanoseconds.
+    pub at_ns: u64,
+    /// Left or right wheel.
+    pub side: usize,
+    /// Levels of both lines after it.
+    pub levels: [Level; 2],
+}
+
+/// The building and all that moves in it.
+pub struct Building {
+    world: World,
+    base: Base,
+    scanner: Scanner,
+    base_from_laser: Isometry2<f64>,
+    beam_us: f64,
+    first_beam_us: f64,
+    /// Pose at each step so far, one ahead of now.
+    poses: Vec<Isometry2<f64>>,
+    ticks: [i64; 2],
+    /// Scans that were sent.
+    pub scans: Vec<TrueScan>,
+}
+
+impl std::fmt::Debug for Building {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Building({})", self.world.name)
+    }
+}
+
+impl Building {
+    /// A robot at the start of the world's path.
+    pub fn new(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> anyhow::Result<Self> {
+        let mut world = world.clone();
+        world.path.pause_s = world.path.pause_s.max(PAUSE_S);
+        // 32 bits, so that differences never wrap here; the timers' own 16 do.
+        let mut wheels = robot.wheels.ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
+        wheels.counter_bits = 32;
+        let mut config = SlamConfig::default();
+        robot.apply(&mut config, robot.beams().unwrap_or(scip::sim::BEAMS), None);
+        let geometry = config.sensor.geometry;
+        let beam_us = f64::from(geometry.revolution_us) / f64::from(geometry.steps_per_revolution);
+        let [base_rng, scanner_rng] = streams(seed);
+        let base = Base::new(&world.path, wheels, &sim.wheel, base_rng);
+        Ok(Self {
+            scanner: Scanner::new(&world, sim.sensor, geometry, scanner_rng),
+            base_from_laser: nalgebra::convert(config.sensor.mounting.base_from_laser),
+            beam_us,
+            first_beam_us: f64::from(geometry.first_step) * beam_us,
+            poses: vec![base.pose],
+            ticks: base.ticks(),
+            base,
+            world,
+            scans: Vec::new(),
+        })
+    }
+
+    /// Whether the end of the path is reached.
+    pub fn arrived(&self) -> bool {
+        self.base.arrived()
+    }
+
+    /// Where `base` is, in the world.
+    pub fn pose_at_us(&self, us: f64) -> Isometry2<f64> {
+        interpolate(&self.poses, us / STEP_US as f64)
+    }
+
+    /// Drives to one step beyond now; the encoders' edges on the way.
+    pub fn advance(&mut self, now_us: u64, edges: &mut Vec<Edge>) {
+        while (self.poses.len() as u64 - 1) * STEP_US <= now_us {
+            let begin_ns = (self.poses.len() as u64 - 1) * STEP_US * 1000;
+            self.base.step(STEP_US as f64 * 1e-6);
+            self.poses.push(self.base.pose);
+            let ticks = self.base.ticks();
+            for (side, (before, after)) in self.ticks.into_iter().zip(ticks).enumerate() {
+                let count = before.abs_diff(after);
+                for k in 1..=count {
+                    let at_ns = begin_ns + (2 * k - 1) * STEP_US * 500 / count;
+                    let tick = if after > before { before + k as i64 } else { before - k as i64 };
+                    edges.push(Edge { at_ns, side, levels: levels(tick) });
+                }
+            }
+            self.ticks = ticks;
+        }
+        edges.sort_by_key(|edge| edge.at_ns);
+    }
+
+    /// Levels of the encoders' lines now.
+    pub fn encoder_levels(&self) -> [[Level; 2]; 2] {
+        self.ticks.map(levels)
+    }
+
+    fn measure(&mut self, begin_us: u64, ranges_mm: &mut [u16]) {
+        let at = |beam: usize| begin_us as f64 + self.first_beam_us + beam as f64 * self.beam_us;
+        let middle_us = at(0).midpoint(at(ranges_mm.len() - 1));
+        let people = self.world.people_at(middle_us * 1e-6);
+        let poses = &self.poses;
+        let base_from_laser = self.base_from_laser;
+        let measured = self
+            .scanner
+            .scan(|beam| interpolate(poses, at(beam) / STEP_US as f64) * base_from_laser, &people);
+        ranges_mm.copy_from_slice(&measured);
+        let world_from_base = self.pose_at_us(middle_us);
+        self.scans.push(TrueScan { middle_us: middle_us as u64, world_from_base, ranges_mm: measured });
+    }
+}
+
+/// Lines of a quadrature encoder: A leads B when it counts up.
+fn levels(tick: i64) -> [Level; 2] {
+    let level = |high| if high { Level::High } else { Level::Low };
+    let phase = tick.rem_euclid(4);
+    [level(phase == 1 || phase == 2), level(phase >= 2)]
+}
+
+/// All of it, with the line between.
+#[derive(Debug)]
+pub struct Room {
+    /// The building.
+    pub building: Building,
+    /// The sensor.
+    pub urg: SimulatedUrg,
+    /// Bit rate of the microcontroller's port.
+    pub host_rate: u32,
+    /// Whether the sensor's plug is in.
+    pub plugged: bool,
+    /// What came over the virtual COM port.
+    pub console: Vec<u8>,
+}
+
+impl Room {
+    /// The sensor powers up at the beginning.
+    pub fn new(building: Building, seed: u64) -> Self {
+        Self { building, urg: SimulatedUrg::new(0, seed), host_rate: 0, plugged: true, console: Vec::new() }
+    }
+
+    /// The sensor has been on for long and streams, at another bit rate than the firmware wants.
+    pub fn already_streaming(&mut self, baud_rate: u32, seed: u64) {
+        self.urg = SimulatedUrg::found(0, seed, baud_rate, Mode::Streaming);
+    }
+
+    /// What goes wrong in the sensor from now on.
+    pub fn set_faults(&mut self, faults: Faults) {
+        self.urg.faults = faults;
+    }
+
+    /// A byte from the microcontroller.
+    pub fn to_sensor(&mut self, byte: u8, now_us: u64) {
+        if self.plugged {
+            self.urg.receive(byte, self.host_rate, now_us);
+        }
+    }
+
+    /// The next byte that the sensor has sent by now. The port hears nothing where the bit rates differ.
+    pub fn from_sensor(&mut self, now_us: u64) -> Option<u8> {
+        let Self { building, urg, .. } = self;
+        urg.advance(now_us, &mut |begin_us, ranges_mm| building.measure(begin_us, ranges_mm));
+        loop {
+            let sent = self.urg.transmit(now_us)?;
+            if self.plugged && rates_agree(self.host_rate, sent.baud_rate) {
+                return Some(sent.byte);
+            }
+        }
+    }
+}

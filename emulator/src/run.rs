@@ -1,0 +1,312 @@
+//! A run: the firmware in the board, the world stepped beside it, faults on time, the log and the record taken as they come.
+
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use anyhow::{Context, anyhow};
+use lineslam::robot::Robot;
+use lineslam::sim::SimConfig;
+use lineslam::sim::world::World;
+use rigless::emulator::{self, AccessKind, Driver, Host, Settled, Start, Stop};
+use rigless::image::Image;
+use rigless::session::Session;
+use rigless::time::VirtualNanos;
+
+use crate::board::{Nucleo, Shared, TIME_DRIVER_EGR, URG_BRR};
+use crate::fault::Fault;
+use crate::firmware::{Log, LogLine, Symbols};
+use crate::record::{Entry, Recorder};
+use crate::room::{Building, Edge, Room, TrueScan};
+
+/// The world is looked at this often, microseconds.
+const GRID_US: u64 = 1000;
+/// The base has stood for so long when the run ends, microseconds.
+const REST_US: u64 = 1_500_000;
+/// The button is pressed for so long, microseconds.
+const PRESS_US: u64 = 200_000;
+/// The map must have been printed by then, microseconds.
+const PRINT_US: u64 = 30_000_000;
+/// Lines of the log that are shown with an error.
+const LAST_LINES: usize = 20;
+/// A byte that nobody takes is lost after this, microseconds.
+const STALE_US: u64 = 2_000;
+
+/// What to run.
+pub struct Plan<'a> {
+    /// The firmware's ELF.
+    pub elf: &'a Path,
+    /// The building.
+    pub world: &'a World,
+    /// The robot that the firmware was built for.
+    pub robot: &'a Robot,
+    /// Errors of base and scanner.
+    pub sim: SimConfig,
+    /// Of all noise.
+    pub seed: u64,
+    /// Ends the run then, if the path has not ended before, virtual seconds.
+    pub seconds: Option<u64>,
+    /// What goes wrong.
+    pub faults: Vec<Fault>,
+}
+
+/// How far a run has come.
+#[derive(Clone, Copy, Debug)]
+pub struct Progress {
+    /// Virtual time, microseconds.
+    pub now_us: u64,
+    /// Distance of the firmware's pose from the truth, metres.
+    pub error_m: f64,
+    /// Segments of the map.
+    pub segments: u32,
+    /// What the last scan took on the microcontroller, microseconds.
+    pub took_us: u32,
+}
+
+/// What a run leaves.
+pub struct Outcome {
+    /// The firmware's record.
+    pub entries: Vec<Entry>,
+    /// Its log.
+    pub log: Vec<LogLine>,
+    /// Scans as the sensor measured and sent them.
+    pub scans: Vec<TrueScan>,
+    /// What came over the virtual COM port.
+    pub console: String,
+    /// Resets, by what caused them, with their virtual time in microseconds.
+    pub resets: Vec<(u64, String)>,
+    /// Times that the LED was switched.
+    pub led_changes: u32,
+    /// Instructions executed.
+    pub instructions: u64,
+    /// Virtual time at the end, microseconds.
+    pub end_us: u64,
+    /// Whether the path was driven to its end.
+    pub arrived: bool,
+}
+
+/// Runs the plan. `progress` is told now and then.
+pub fn run(plan: &Plan<'_>, progress: impl FnMut(Progress) + Send + 'static) -> anyhow::Result<Outcome> {
+    let elf = std::fs::read(plan.elf).with_context(|| plan.elf.display().to_string())?;
+    let symbols = Symbols::read(&elf, plan.elf)?;
+    let building = Building::new(plan.world, plan.robot, &plan.sim, plan.seed)?;
+    let mut room = Room::new(building, plan.seed);
+    for fault in &plan.faults {
+        fault.prepare(&mut room, plan.seed);
+    }
+    let shared: Shared = Arc::new(Mutex::new(room));
+    let board = Nucleo::new(shared.clone())?;
+    let session = Session::new(Box::new(board), 0, VirtualNanos(GRID_US * 1000))?;
+    let driver = Director {
+        shared,
+        log: Log::new(&elf, plan.elf, symbols.rtt)?,
+        recorder: Recorder::new(symbols.trace),
+        lines: Vec::new(),
+        edges: VecDeque::new(),
+        grid_us: 0,
+        faults: plan.faults.clone(),
+        seed: plan.seed,
+        limit_us: plan.seconds.map_or(u64::MAX, |s| s * 1_000_000),
+        rested_us: None,
+        pressed_us: None,
+        map_printed: false,
+        resets: 0,
+        led: false,
+        led_changes: 0,
+        progress: Box::new(progress),
+        failure: None,
+    };
+    let images = [Image::new(plan.elf, elf, None)?];
+    let mut finished = emulator::run(session, &Start::new(&images), driver)?;
+    if let Some(error) = finished.driver.failure.take() {
+        let log = &finished.driver.lines;
+        let last = log.iter().skip(log.len().saturating_sub(LAST_LINES)).map(|l| format!("\n{l}"));
+        return Err(error.context(format!("the firmware's log ends with:{}", last.collect::<String>())));
+    }
+    if let Some(error) = finished.session.take_error() {
+        return Err(error.into());
+    }
+    let stop = finished.stop.context("the run ended by itself")?;
+    let resets =
+        finished.session.resets().iter().map(|r| (r.at.0 / 1000, format!("{:?}", r.cause))).collect();
+    let director = finished.driver;
+    let mut room = director.shared.lock().map_err(|_| anyhow!("the simulation panicked"))?;
+    Ok(Outcome {
+        entries: director.recorder.entries,
+        log: director.lines,
+        scans: std::mem::take(&mut room.building.scans),
+        console: String::from_utf8_lossy(&room.console).into_owned(),
+        resets,
+        led_changes: director.led_changes,
+        instructions: stop.instruction_count,
+        end_us: stop.at.0 / 1000,
+        arrived: room.building.arrived(),
+    })
+}
+
+/// Drives the run: everything that happens on virtual time outside the microcontroller.
+struct Director {
+    shared: Shared,
+    log: Log,
+    recorder: Recorder,
+    lines: Vec<LogLine>,
+    edges: VecDeque<Edge>,
+    grid_us: u64,
+    faults: Vec<Fault>,
+    seed: u64,
+    limit_us: u64,
+    rested_us: Option<u64>,
+    pressed_us: Option<u64>,
+    map_printed: bool,
+    resets: usize,
+    led: bool,
+    led_changes: u32,
+    progress: Box<dyn FnMut(Progress) + Send>,
+    failure: Option<anyhow::Error>,
+}
+
+impl Driver<Nucleo> for Director {
+    fn on_settled(&mut self, session: &mut Session<Nucleo>, _: &mut dyn Host, settled: Settled) {
+        let Settled::Access { access, .. } = settled else { return };
+        if access.kind != AccessKind::Write {
+            return;
+        }
+        match access.address {
+            TIME_DRIVER_EGR => session.board_mut().clear_time_driver_flags(),
+            URG_BRR => {
+                let rate = session.board_mut().urg_baud_rate(access.value);
+                if let Ok(mut room) = self.shared.lock() {
+                    room.host_rate = rate;
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn on_stop(
+        &mut self,
+        session: &mut Session<Nucleo>,
+        stop: Stop,
+        host: &mut dyn Host,
+    ) -> Option<VirtualNanos> {
+        match self.advance(session, stop, host) {
+            Ok(next) => next,
+            Err(error) => {
+                self.failure = Some(error);
+                None
+            }
+        }
+    }
+}
+
+impl Director {
+    fn advance(
+        &mut self,
+        session: &mut Session<Nucleo>,
+        stop: Stop,
+        host: &mut dyn Host,
+    ) -> anyhow::Result<Option<VirtualNanos>> {
+        let now_ns = stop.at.0;
+        while let Some(edge) = self.edges.pop_front_if(|e| e.at_ns <= now_ns) {
+            session.board_mut().drive_encoder(stop.at, edge.side, edge.levels);
+        }
+        if now_ns / 1000 >= self.grid_us {
+            self.grid_us = now_ns / 1000 / GRID_US * GRID_US + GRID_US;
+            if self.on_grid(session, stop, host)? {
+                return Ok(None);
+            }
+        }
+        let sensor_us = self.room(|room| room.urg.next_us())?;
+        let edge_ns = self.edges.front().map_or(u64::MAX, |e| e.at_ns);
+        let sensor_ns = if sensor_us * 1000 > now_ns { sensor_us * 1000 } else { u64::MAX };
+        Ok(Some(VirtualNanos((self.grid_us * 1000).min(edge_ns).min(sensor_ns).max(now_ns + 1))))
+    }
+
+    fn room<R>(&self, use_it: impl FnOnce(&mut Room) -> R) -> anyhow::Result<R> {
+        let mut room = self.shared.lock().map_err(|_| anyhow!("the simulation panicked"))?;
+        Ok(use_it(&mut room))
+    }
+
+    /// Once a millisecond. True at the end of the run.
+    fn on_grid(
+        &mut self,
+        session: &mut Session<Nucleo>,
+        stop: Stop,
+        host: &mut dyn Host,
+    ) -> anyhow::Result<bool> {
+        let now_us = stop.at.0 / 1000;
+        self.log.drain(host, &mut self.lines)?;
+        if session.resets().len() != self.resets {
+            self.resets = session.resets().len();
+            self.recorder.restarted();
+            // The lines stand as they stood.
+            let levels = self.room(|room| room.building.encoder_levels())?;
+            for (side, levels) in levels.into_iter().enumerate() {
+                session.board_mut().drive_encoder(stop.at, side, levels);
+            }
+        }
+        if self.recorder.look(host, now_us)? {
+            self.tell(now_us)?;
+        }
+        let mut edges = Vec::new();
+        self.room(|room| {
+            room.building.advance(now_us, &mut edges);
+            while room.urg.next_us() + STALE_US < now_us && room.from_sensor(now_us).is_some() {}
+        })?;
+        self.edges.extend(edges);
+        for fault in self.faults.clone() {
+            fault.at(now_us, GRID_US, self.seed, session, &self.shared, stop, host)?;
+        }
+        let led = session.board_mut().led();
+        self.led_changes += u32::from(std::mem::replace(&mut self.led, led) != led);
+        self.is_over(session, stop, now_us)
+    }
+
+    /// Lets the base rest, presses the button, and waits for the map.
+    fn is_over(
+        &mut self,
+        session: &mut Session<Nucleo>,
+        stop: Stop,
+        now_us: u64,
+    ) -> anyhow::Result<bool> {
+        let arrived = self.room(|room| room.building.arrived())?;
+        if self.rested_us.is_none() && arrived {
+            self.rested_us = Some(now_us + REST_US);
+        }
+        let due = self.limit_us.min(self.rested_us.unwrap_or(u64::MAX));
+        match self.pressed_us {
+            None if now_us >= due => {
+                self.pressed_us = Some(now_us);
+                session.board_mut().press(stop.at, true);
+                Ok(false)
+            }
+            None => Ok(false),
+            Some(pressed_us) => {
+                if now_us == pressed_us + PRESS_US {
+                    session.board_mut().press(stop.at, false);
+                }
+                if now_us > pressed_us + PRINT_US {
+                    return Err(anyhow!("the map was not printed when the button was pressed"));
+                }
+                self.map_printed |= self.lines.iter().rev().take(20).any(|l| l.text == "end of map");
+                Ok(self.map_printed && now_us > pressed_us + PRESS_US)
+            }
+        }
+    }
+
+    fn tell(&mut self, now_us: u64) -> anyhow::Result<()> {
+        let Some(entry) = self.recorder.entries.last() else { return Ok(()) };
+        let crate::record::Event::Scan { ranges_mm, took_us, .. } = &entry.event else { return Ok(()) };
+        let (pose, segments, took_us) = (entry.map_from_base(), entry.segments, *took_us);
+        let error_m = self.room(|room| {
+            let scans = &room.building.scans;
+            let truth = scans.iter().rev().take(5).find(|s| s.ranges_mm == *ranges_mm);
+            truth.zip(scans.first()).map(|(truth, first)| {
+                let estimate = first.world_from_base * nalgebra::convert::<_, nalgebra::Isometry2<f64>>(pose);
+                (estimate.translation.vector - truth.world_from_base.translation.vector).norm()
+            })
+        })?;
+        (self.progress)(Progress { now_us, error_m: error_m.unwrap_or(f64::NAN), segments, took_us });
+        Ok(())
+    }
+}

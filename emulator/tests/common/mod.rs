@@ -1,0 +1,64 @@
+//! What the tests on the emulated board share.
+#![allow(dead_code)] // Each test file uses its part.
+
+use std::path::{Path, PathBuf};
+
+use emulator::fault::Fault;
+use emulator::record::{Entry, Event};
+use emulator::report::{self, Judged};
+use emulator::run::{Outcome, Plan, run};
+use lineslam::robot::Robot;
+use lineslam::sim::SimConfig;
+use lineslam::sim::world::World;
+
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+/// The firmware's ELF, which `cargo xtask firmware` builds; `LINESLAM_FIRMWARE` and `LINESLAM_FIRMWARE_HANG` name others.
+pub fn elf(hang: bool) -> PathBuf {
+    let (variable, folder) =
+        if hang { ("LINESLAM_FIRMWARE_HANG", "target/hang") } else { ("LINESLAM_FIRMWARE", "target") };
+    let usual = root().join(folder).join("thumbv7em-none-eabihf/release/firmware");
+    let elf = std::env::var_os(variable).map_or(usual, PathBuf::from);
+    assert!(elf.exists(), "{} is not there: run `cargo xtask test`, which builds it", elf.display());
+    elf
+}
+
+pub fn robot() -> Robot {
+    Robot::load(&root().join("robots/paper.toml")).expect("the robot file")
+}
+
+pub fn world(name: &str) -> World {
+    World::load(&root().join(format!("worlds/{name}.toml"))).expect("the world")
+}
+
+/// Runs the hall for a while, with these faults.
+pub fn hall(seconds: Option<u64>, faults: &[&str]) -> (Outcome, Judged) {
+    run_in("hall", seconds, faults, false)
+}
+
+pub fn run_in(name: &str, seconds: Option<u64>, faults: &[&str], hang: bool) -> (Outcome, Judged) {
+    let (world, robot, seed) = (world(name), robot(), 11);
+    let faults = faults.iter().map(|f| f.parse::<Fault>().expect("a fault")).collect();
+    let elf = elf(hang);
+    let plan =
+        Plan { elf: &elf, world: &world, robot: &robot, sim: SimConfig::default(), seed, seconds, faults };
+    let outcome = run(&plan, |_| ()).unwrap_or_else(|error| panic!("{error:#}"));
+    let judged = report::judge(&world, seed, &outcome).expect("a run that can be judged");
+    (outcome, judged)
+}
+
+/// Whether a line of the log has this text in it.
+pub fn says(outcome: &Outcome, level: &str, text: &str) -> bool {
+    outcome.log.iter().any(|line| line.level == level && line.text.contains(text))
+}
+
+/// The error of the last pose, metres.
+pub fn last_error_m(judged: &Judged) -> f64 {
+    judged.report.trajectory.final_position_error_m
+}
+
+pub fn scans(entries: &[Entry]) -> impl Iterator<Item = &Entry> {
+    entries.iter().filter(|e| matches!(e.event, Event::Scan { .. }))
+}

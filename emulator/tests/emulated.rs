@@ -1,0 +1,120 @@
+//! The firmware on the emulated board: the very ELF that is flashed, in the hall.
+
+mod common;
+
+use common::{hall, last_error_m, robot, run_in, says, scans};
+use emulator::record::Event;
+use emulator::report::first_difference;
+
+#[test]
+fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
+    let (outcome, judged) = hall(None, &[]);
+    let report = &judged.report;
+    println!("{report:#?}");
+    assert!(outcome.arrived);
+    assert!(report.corner_error_m.is_some_and(|e| e <= 0.050), "{:?}", report.corner_error_m);
+    assert!(report.corners_found * 2 >= report.corners);
+    assert!(report.worst_position_error_m < 0.15);
+    // The one that is on its way at the end.
+    assert!(report.scans_sent - report.scans_used <= 1, "{} of {}", report.scans_used, report.scans_sent);
+    assert!(says(&outcome, "INFO", "lidar: missed 0, dropped 0, port errors"));
+    assert!(!says(&outcome, "WARN", "dropped") && !says(&outcome, "ERROR", ""));
+    assert_eq!(outcome.resets, []);
+    // A poll of the counters each 5 ms has seen them wrap.
+    let ticks = outcome.entries.iter().flat_map(|e| &e.samples).map(|s| s.left).max();
+    assert!(ticks.is_some_and(|t| t > 3 * 65_536), "{ticks:?}");
+    // The virtual COM port has a pose for each scan but those that a newer one replaced.
+    let poses = outcome.console.lines().filter(|l| l.split(' ').count() == 8).count();
+    assert!(poses * 100 >= report.scans_used * 95, "{poses} of {}", report.scans_used);
+    assert!(outcome.led_changes > 100);
+}
+
+#[test]
+fn the_board_and_the_pc_agree_bit_for_bit_over_sixty_seconds() {
+    let (outcome, judged) = hall(Some(60), &[]);
+    assert!(judged.report.scans_used > 560, "{}", judged.report.scans_used);
+    assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None);
+    // The comparison can fail: one range changed by a millimetre is noticed.
+    let mut entries = outcome.entries;
+    let changed = entries.iter_mut().rev().nth(20).unwrap();
+    if let Event::Scan { ranges_mm, .. } = &mut changed.event {
+        ranges_mm.iter_mut().for_each(|r| *r += 1);
+    }
+    assert!(first_difference(&entries, &robot()).unwrap().is_some());
+}
+
+#[test]
+fn a_sensor_unplugged_for_five_seconds_is_bridged_by_odometry() {
+    let (outcome, judged) = hall(Some(45), &["unplug@20+5"]);
+    assert!(says(&outcome, "WARN", "going on by odometry"));
+    assert!(says(&outcome, "INFO", "scans again"));
+    assert_eq!(outcome.resets, []);
+    assert!(outcome.entries.iter().any(|e| matches!(e.event, Event::Coasted { .. }) && e.read_us > 20_000_000));
+    let gap = scans(&outcome.entries).filter(|e| (22_000_000..24_000_000).contains(&e.read_us)).count();
+    assert_eq!(gap, 0);
+    assert!(last_error_m(&judged) < 0.10, "{}", last_error_m(&judged));
+    assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None);
+}
+
+#[test]
+fn one_garbled_byte_in_ten_thousand_costs_scans_but_not_the_pose() {
+    let (outcome, judged) = hall(Some(60), &["garble=10000"]);
+    assert!(says(&outcome, "WARN", "a scan was dropped"));
+    let share = judged.report.scans_used as f64 / judged.report.scans_sent as f64;
+    assert!((0.6..0.95).contains(&share), "{share}");
+    assert!(judged.report.worst_position_error_m < 0.10, "{}", judged.report.worst_position_error_m);
+    assert_eq!(outcome.resets, []);
+}
+
+#[test]
+fn noise_and_framing_errors_on_the_line_are_counted_and_survived() {
+    let (outcome, judged) = hall(Some(60), &["line=30"]);
+    let counted = outcome.log.iter().rev().find_map(|line| {
+        let (_, rest) = line.text.split_once("port errors ")?;
+        rest.split(',').next()?.parse::<u32>().ok()
+    });
+    assert!(counted.is_some_and(|n| n > 10), "{counted:?}");
+    assert!(judged.report.scans_used * 2 > judged.report.scans_sent);
+    assert!(judged.report.worst_position_error_m < 0.10, "{}", judged.report.worst_position_error_m);
+    assert_eq!(outcome.resets, []);
+}
+
+#[test]
+fn a_sensor_that_streams_at_another_bit_rate_is_taken_over() {
+    let (outcome, judged) = hall(Some(30), &["streaming=750000"]);
+    assert!(says(&outcome, "INFO", "500000 bit/s"));
+    assert!(judged.report.scans_used > 200);
+    assert!(last_error_m(&judged) < 0.10, "{}", last_error_m(&judged));
+}
+
+#[test]
+fn a_reset_by_pin_while_driving_keeps_map_and_pose() {
+    let (outcome, judged) = hall(Some(50), &["reset@25.0373"]);
+    assert_eq!(outcome.resets.len(), 1);
+    assert!(says(&outcome, "INFO", "reset by Pin"));
+    assert!(says(&outcome, "INFO", "is kept"));
+    assert!(outcome.entries.iter().any(|e| e.event == Event::Resumed));
+    assert!(last_error_m(&judged) < 0.10, "{}", last_error_m(&judged));
+    // The map goes on: more segments than it would have after half the drive.
+    let before = outcome.entries.iter().rev().find(|e| e.read_us < 25_000_000).unwrap().segments;
+    assert!(outcome.entries.last().unwrap().segments + 5 >= before);
+    assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None);
+}
+
+#[test]
+fn a_firmware_that_hangs_is_reset_by_the_watchdog_and_keeps_its_map() {
+    let (outcome, judged) = run_in("hall", Some(40), &[], true);
+    assert_eq!(outcome.resets.len(), 1, "{:?}", outcome.resets);
+    assert!(says(&outcome, "ERROR", "hanging, as this build is told to"));
+    assert!(says(&outcome, "INFO", "reset by Watchdog"));
+    assert!(says(&outcome, "INFO", "is kept"));
+    assert!(last_error_m(&judged) < 0.10, "{}", last_error_m(&judged));
+}
+
+#[test]
+fn stamps_of_the_sensor_wrap_without_notice() {
+    let (outcome, judged) = hall(Some(40), &["stamp-wrap"]);
+    assert!(says(&outcome, "INFO", "lidar: missed 0, dropped 0"));
+    assert!(judged.report.worst_position_error_m < 0.10, "{}", judged.report.worst_position_error_m);
+    assert!(judged.report.scans_sent - judged.report.scans_used <= 1);
+}

@@ -1,0 +1,242 @@
+//! NUCLEO-F429ZI. The wiring is drawn in the README.
+//!
+//! | what | pins | header |
+//! |---|---|---|
+//! | URG, USART6 through a level shifter | PG9 receives, PG14 transmits | CN10-16 (D0), CN10-14 (D1) |
+//! | left encoder, TIM4 | PD12 A, PD13 B | CN10-21 (D29), CN10-19 (D28) |
+//! | right encoder, TIM3 | PC6 A, PC7 B | CN7-1 (D16), CN7-11 (D21) |
+//! | trajectory, USART3 | PD8 transmits | the ST-LINK's virtual COM port |
+//! | user LED, user button | PB0, PC13 | on the board |
+
+use embassy_stm32::gpio::{Input, Level, Output, Pull, Speed};
+use embassy_stm32::interrupt::{self, InterruptExt, Priority};
+use embassy_stm32::mode::Async;
+use embassy_stm32::timer::qei::Qei;
+use embassy_stm32::usart::{self, RingBufferedUartRx, Uart, UartTx};
+use embassy_stm32::wdg::IndependentWatchdog;
+use embassy_stm32::{Config, Peri, bind_interrupts, dma, pac, peripherals, rcc, time};
+use static_cell::StaticCell;
+
+/// For the boot banner.
+pub const NAME: &str = "NUCLEO-F429ZI";
+
+/// The interrupt that runs what must not wait for the map. The board has no use for UART5 itself.
+pub use embassy_stm32::interrupt::UART5 as URGENT;
+
+/// Bytes that DMA may hold for the lidar task: 10 ms at 500 kbit/s, ten times its longest wait.
+const RING: usize = 512;
+
+bind_interrupts!(struct Irqs {
+    USART6 => usart::InterruptHandler<peripherals::USART6>;
+    USART3 => usart::InterruptHandler<peripherals::USART3>;
+    DMA2_STREAM1 => dma::InterruptHandler<peripherals::DMA2_CH1>;
+    DMA2_STREAM6 => dma::InterruptHandler<peripherals::DMA2_CH6>;
+    DMA1_STREAM3 => dma::InterruptHandler<peripherals::DMA1_CH3>;
+});
+
+/// What the board has, each part to be handed to the task that uses it.
+pub struct Board {
+    /// The scanner's port.
+    pub lidar: LidarPins,
+    /// The encoders' timers.
+    pub encoders: EncoderPins,
+    /// The virtual COM port.
+    pub console: ConsolePins,
+    /// Shows that the firmware lives.
+    pub led: Output<'static>,
+    /// High while pressed.
+    pub button: Input<'static>,
+    /// Resets the board unless it is fed.
+    pub watchdog: IndependentWatchdog<'static, peripherals::IWDG>,
+}
+
+/// Pins and DMA channels of the scanner's port.
+pub struct LidarPins {
+    usart: Peri<'static, peripherals::USART6>,
+    rx: Peri<'static, peripherals::PG9>,
+    tx: Peri<'static, peripherals::PG14>,
+    rx_dma: Peri<'static, peripherals::DMA2_CH1>,
+    tx_dma: Peri<'static, peripherals::DMA2_CH6>,
+}
+
+/// Pins and timers of the encoders.
+pub struct EncoderPins {
+    left: Peri<'static, peripherals::TIM4>,
+    left_a: Peri<'static, peripherals::PD12>,
+    left_b: Peri<'static, peripherals::PD13>,
+    right: Peri<'static, peripherals::TIM3>,
+    right_a: Peri<'static, peripherals::PC6>,
+    right_b: Peri<'static, peripherals::PC7>,
+}
+
+/// Pin and DMA channel of the virtual COM port.
+pub struct ConsolePins {
+    usart: Peri<'static, peripherals::USART3>,
+    tx: Peri<'static, peripherals::PD8>,
+    tx_dma: Peri<'static, peripherals::DMA1_CH3>,
+}
+
+/// Why the board started.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
+pub enum ResetCause {
+    /// Power came, or had fallen too low.
+    Power,
+    /// The independent watchdog was not fed.
+    Watchdog,
+    /// The firmware asked for it: a panic or a fault.
+    Software,
+    /// The reset pin.
+    Pin,
+    /// Anything else.
+    Other,
+}
+
+/// Clocks, pins, interrupts. To be called once, first.
+pub fn start() -> (Board, ResetCause) {
+    let cause = reset_cause();
+    let p = embassy_stm32::init(clocks());
+    // The firmware's own urgent work comes after what the hardware cannot hold back, bytes and time.
+    interrupt::UART5.set_priority(Priority::P6);
+    let board = Board {
+        lidar: LidarPins { usart: p.USART6, rx: p.PG9, tx: p.PG14, rx_dma: p.DMA2_CH1, tx_dma: p.DMA2_CH6 },
+        encoders: EncoderPins {
+            left: p.TIM4,
+            left_a: p.PD12,
+            left_b: p.PD13,
+            right: p.TIM3,
+            right_a: p.PC6,
+            right_b: p.PC7,
+        },
+        console: ConsolePins { usart: p.USART3, tx: p.PD8, tx_dma: p.DMA1_CH3 },
+        led: Output::new(p.PB0, Level::Low, Speed::Low),
+        // The board has a pull-down resistor.
+        button: Input::new(p.PC13, Pull::None),
+        watchdog: IndependentWatchdog::new(p.IWDG, crate::mapping::WATCHDOG_US),
+    };
+    (board, cause)
+}
+
+/// 180 MHz from the 8 MHz that the ST-LINK gives.
+fn clocks() -> Config {
+    use rcc::{AHBPrescaler, APBPrescaler, Hse, HseMode, Pll, PllMul, PllPDiv, PllPreDiv, PllSource, Sysclk};
+    let mut config = Config::default();
+    config.rcc.hse = Some(Hse { freq: time::Hertz(8_000_000), mode: HseMode::Bypass });
+    config.rcc.pll_src = PllSource::HSE;
+    config.rcc.pll = Some(Pll {
+        prediv: PllPreDiv::DIV4,
+        mul: PllMul::MUL180,
+        divp: Some(PllPDiv::DIV2),
+        divq: None,
+        divr: None,
+    });
+    config.rcc.sys = Sysclk::PLL1_P;
+    config.rcc.ahb_pre = AHBPrescaler::DIV1;
+    config.rcc.apb1_pre = APBPrescaler::DIV4;
+    config.rcc.apb2_pre = APBPrescaler::DIV2;
+    config
+}
+
+/// Reads the reset flags and clears them for the next time. A power-up sets the pin's flag too.
+fn reset_cause() -> ResetCause {
+    let flags = pac::RCC.csr().read();
+    pac::RCC.csr().modify(|w| w.set_rmvf(true));
+    if flags.porrstf() || flags.borrstf() {
+        ResetCause::Power
+    } else if flags.wdgrstf() {
+        ResetCause::Watchdog
+    } else if flags.sftrstf() {
+        ResetCause::Software
+    } else if flags.padrstf() {
+        ResetCause::Pin
+    } else {
+        ResetCause::Other
+    }
+}
+
+/// The scanner's port: DMA both ways, the receiver into a ring.
+pub struct LidarPort {
+    tx: UartTx<'static, Async>,
+    rx: RingBufferedUartRx<'static>,
+}
+
+impl LidarPins {
+    /// Opens the port. `None` if the bit rate cannot be made, which it can.
+    pub fn open(self) -> Option<LidarPort> {
+        static BUFFER: StaticCell<[u8; RING]> = StaticCell::new();
+        let uart = Uart::new(
+            self.usart,
+            self.rx,
+            self.tx,
+            self.tx_dma,
+            self.rx_dma,
+            Irqs,
+            usart::Config::default(),
+        );
+        let (tx, rx) = uart.ok()?.split();
+        Some(LidarPort { tx, rx: rx.into_ring_buffered(BUFFER.init([0; RING])) })
+    }
+}
+
+impl embedded_io_async::ErrorType for LidarPort {
+    type Error = usart::Error;
+}
+
+impl embedded_io_async::Read for LidarPort {
+    async fn read(&mut self, buffer: &mut [u8]) -> Result<usize, usart::Error> {
+        self.rx.read(buffer).await
+    }
+}
+
+impl embedded_io_async::Write for LidarPort {
+    async fn write(&mut self, bytes: &[u8]) -> Result<usize, usart::Error> {
+        self.tx.write(bytes).await?;
+        Ok(bytes.len())
+    }
+
+    async fn flush(&mut self) -> Result<(), usart::Error> {
+        self.tx.flush().await
+    }
+}
+
+impl scip::SerialPort for LidarPort {
+    fn set_baud_rate(&mut self, bits_per_second: u32) -> Result<(), usart::Error> {
+        // A rate that the divider cannot make stays as it was; the search goes on at the next.
+        match self.rx.set_baudrate(bits_per_second) {
+            Ok(()) => Ok(()),
+            Err(error) => {
+                defmt::warn!("{=u32} bit/s cannot be made: {}", bits_per_second, error);
+                Ok(())
+            }
+        }
+    }
+}
+
+/// Both encoders, counted by timers.
+pub struct Encoders {
+    left: Qei<'static, peripherals::TIM4>,
+    right: Qei<'static, peripherals::TIM3>,
+}
+
+impl EncoderPins {
+    /// Starts counting, from zero.
+    pub fn start(self) -> Encoders {
+        Encoders {
+            left: Qei::new(self.left, self.left_a, self.left_b, Default::default()),
+            right: Qei::new(self.right, self.right_a, self.right_b, Default::default()),
+        }
+    }
+}
+
+impl Encoders {
+    /// Counters of the left and right wheel, which wrap.
+    pub fn counts(&self) -> [u16; 2] {
+        [self.left.count(), self.right.count()]
+    }
+}
+
+impl ConsolePins {
+    /// Opens the port at 115 200 bit/s. `None` if that cannot be made, which it can.
+    pub fn open(self) -> Option<UartTx<'static, Async>> {
+        UartTx::new(self.usart, self.tx, self.tx_dma, Irqs, usart::Config::default()).ok()
+    }
+}

@@ -1,0 +1,193 @@
+//! What a reset does not take: the map with the pose, and the wheels' ticks, in RAM that the start-up code leaves alone.
+//!
+//! The map is valid where its seal says so: a magic word, the checksum of this firmware's own code (another firmware
+//! lays memory out differently), and the checksum of the map itself. It is open while it is worked on, 2 to 3 % of the
+//! time; a reset in that time starts a new map. Power-up leaves noise, which no checksum fits.
+
+use core::mem::MaybeUninit;
+use core::ptr::{addr_of, addr_of_mut};
+use core::sync::atomic::{Ordering, compiler_fence};
+
+use crc::{CRC_32_ISO_HDLC, Crc, Table};
+use slam_core::ConfigError;
+
+use crate::robot;
+
+/// Map segments there is room for.
+pub const SEGMENTS: usize = 512;
+/// Odometry samples there is room for: 0.32 s.
+pub const SAMPLES: usize = 64;
+
+/// The map, the pose and the odometry.
+pub type Mapper = slam_core::Mapper<SEGMENTS, SAMPLES>;
+
+const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
+const MAGIC: u32 = 0x4C53_4C4D;
+
+/// What happened to the map at start-up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
+pub enum Found {
+    /// It is as the last run left it.
+    Map,
+    /// There is none: power-up, or another firmware ran.
+    Nothing,
+    /// The last run was reset while it worked on the map.
+    Open,
+    /// Its checksum is wrong.
+    Damaged,
+}
+
+#[repr(C)]
+struct Seal {
+    magic: u32,
+    firmware: u32,
+    open: u32,
+    checksum: u32,
+}
+
+#[repr(C)]
+struct Store {
+    seal: MaybeUninit<Seal>,
+    mapper: MaybeUninit<Mapper>,
+}
+
+#[unsafe(link_section = ".uninit.STORE")]
+static mut STORE: Store = Store { seal: MaybeUninit::uninit(), mapper: MaybeUninit::uninit() };
+
+/// The one owner of the kept map.
+pub struct Keeper {
+    seal: &'static mut Seal,
+    mapper: &'static mut Mapper,
+}
+
+impl Keeper {
+    /// Takes the map that the last run left, or begins a new one. To be called once.
+    pub fn take() -> Result<(Self, Found), ConfigError> {
+        let firmware = firmware_checksum();
+        let store = addr_of_mut!(STORE);
+        // SAFETY: called once, before any task runs, so nothing else refers to the store. A seal is four numbers, of
+        // which any bits are valid. The mapper is only taken as one where the seal says that this very firmware left
+        // these very bytes there.
+        unsafe {
+            let seal = (*store).seal.assume_init_mut();
+            let mapper = addr_of_mut!((*store).mapper);
+            let found = if seal.magic != MAGIC || seal.firmware != firmware {
+                Found::Nothing
+            } else if seal.open != 0 {
+                Found::Open
+            } else if seal.checksum != checksum(mapper) {
+                Found::Damaged
+            } else {
+                Found::Map
+            };
+            if found != Found::Map {
+                *seal = Seal { magic: 0, firmware, open: 1, checksum: 0 };
+                Mapper::new_in(&mut *mapper, robot::config(), robot::DRIVE)?;
+            }
+            let mut keeper = Self { seal, mapper: (*mapper).assume_init_mut() };
+            keeper.update(|_| ());
+            Ok((keeper, found))
+        }
+    }
+
+    /// The map, to look at.
+    pub fn mapper(&self) -> &Mapper {
+        self.mapper
+    }
+
+    /// Works on the map and seals it again.
+    pub fn update<R>(&mut self, work: impl FnOnce(&mut Mapper) -> R) -> R {
+        self.seal.open = 1;
+        compiler_fence(Ordering::SeqCst);
+        let result = work(self.mapper);
+        compiler_fence(Ordering::SeqCst);
+        // SAFETY: the mapper is initialised, and nothing else refers to it now.
+        self.seal.checksum = unsafe { checksum(core::ptr::from_mut(self.mapper).cast()) };
+        self.seal.magic = MAGIC;
+        compiler_fence(Ordering::SeqCst);
+        self.seal.open = 0;
+        result
+    }
+}
+
+/// Checksum of the store's mapper, padding included.
+///
+/// # Safety
+/// `mapper` must point to the store's mapper, which nothing may write meanwhile. Its bytes may be whatever power-up left:
+/// they lie in RAM that has been there all along, so that each has a value, and the black box keeps the compiler from
+/// thinking otherwise.
+unsafe fn checksum(mapper: *const MaybeUninit<Mapper>) -> u32 {
+    let bytes = core::hint::black_box(mapper.cast::<u8>());
+    // SAFETY: these are the mapper's bytes.
+    CRC.checksum(unsafe { core::slice::from_raw_parts(bytes, Mapper::BYTES) })
+}
+
+/// Checksum of this firmware's code.
+fn firmware_checksum() -> u32 {
+    unsafe extern "C" {
+        static __stext: u8;
+        static __etext: u8;
+    }
+    let (from, to) = (addr_of!(__stext), addr_of!(__etext));
+    // SAFETY: the linker puts the code between these two, and nobody writes it.
+    let code = unsafe { core::slice::from_raw_parts(from, to.addr() - from.addr()) };
+    CRC.checksum(code)
+}
+
+/// The wheels' ticks, twice, so that a reset while one is written leaves the other.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct TickSlot {
+    order: u32,
+    totals: [i32; 2],
+    check: u32,
+}
+
+impl TickSlot {
+    fn check(&self) -> u32 {
+        let [left, right] = self.totals;
+        MAGIC ^ self.order.rotate_left(7) ^ (left as u32).rotate_left(13) ^ (right as u32).rotate_left(23)
+    }
+}
+
+#[unsafe(link_section = ".uninit.TICKS")]
+static mut TICKS: MaybeUninit<[TickSlot; 2]> = MaybeUninit::uninit();
+
+/// The one owner of the kept ticks.
+pub struct KeptTicks {
+    slots: &'static mut [TickSlot; 2],
+}
+
+impl KeptTicks {
+    /// Takes them. To be called once; `afresh` where there is no map that they belong to.
+    pub fn take(afresh: bool) -> Self {
+        // SAFETY: called once, before any task runs, so nothing else refers to them; any bits are valid numbers.
+        let slots = unsafe { (*addr_of_mut!(TICKS)).assume_init_mut() };
+        if afresh {
+            for slot in slots.iter_mut() {
+                *slot = TickSlot { order: 0, totals: [0; 2], check: 0 };
+                slot.check = slot.check();
+            }
+        }
+        Self { slots }
+    }
+
+    /// The newest that is whole; zero without any.
+    pub fn read(&self) -> [i32; 2] {
+        let whole = self.slots.iter().filter(|slot| slot.check == slot.check());
+        whole.max_by_key(|slot| slot.order).map_or([0; 2], |slot| slot.totals)
+    }
+
+    /// Keeps new ones, in place of the older.
+    pub fn write(&mut self, totals: [i32; 2]) {
+        let newest = self.slots.iter().filter(|s| s.check == s.check()).map(|s| s.order).max().unwrap_or(0);
+        let order = newest.wrapping_add(1);
+        if let Some(slot) = self.slots.get_mut(order as usize % 2) {
+            slot.check = !slot.check;
+            compiler_fence(Ordering::SeqCst);
+            (slot.order, slot.totals) = (order, totals);
+            compiler_fence(Ordering::SeqCst);
+            slot.check = slot.check();
+        }
+    }
+}

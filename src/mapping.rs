@@ -1,0 +1,246 @@
+//! The map: takes in scans and wheel ticks in thread mode, says what it knows, and feeds the watchdog.
+//!
+//! Everything urgent runs above this in interrupts: a long update delays no byte and no tick.
+
+use core::sync::atomic::{AtomicBool, Ordering};
+
+use embassy_futures::select::{Either, select};
+use embassy_stm32::peripherals::IWDG;
+use embassy_stm32::wdg::IndependentWatchdog;
+use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
+use embassy_sync::zerocopy_channel::Receiver;
+use embassy_time::{Duration, Instant, Ticker};
+use slam_core::pose::components;
+
+use crate::console::{CONSOLE, PoseLine};
+use crate::encoders;
+use crate::kept::{Found, Keeper};
+use crate::lidar::{STATE, ScanBuffer};
+use crate::trace::{Event, Tracer, sigma};
+
+/// Unfed for so long, the watchdog resets the board. Its clock may run half as fast again as it should.
+pub const WATCHDOG_US: u32 = 3_000_000;
+/// Without a scan the map moves on by odometry so often …
+const COAST_EVERY: Duration = Duration::from_millis(50);
+/// … to so long ago: the longest that a scan may be on its way, its bytes at 115 200 bit/s included.
+const COAST_BEHIND_US: u64 = 230_000;
+/// The status is logged so often.
+const STATUS_EVERY: Duration = Duration::from_secs(1);
+/// Segments of the map that are printed at once.
+const PRINT_AT_ONCE: usize = 8;
+
+/// Set to have the map printed.
+pub static PRINT_MAP: AtomicBool = AtomicBool::new(false);
+
+/// Maps for ever.
+#[embassy_executor::task]
+pub async fn run(
+    keeper: Keeper,
+    found: Found,
+    tracer: Tracer,
+    mut scans: Receiver<'static, CriticalSectionRawMutex, ScanBuffer>,
+    mut watchdog: IndependentWatchdog<'static, IWDG>,
+) {
+    let mut mapping = Mapping::new(keeper, tracer);
+    if found == Found::Map {
+        mapping.resume();
+    }
+    let mut ticker = Ticker::every(COAST_EVERY);
+    let mut absences = STATE.absences.load(Ordering::Relaxed);
+    loop {
+        match select(scans.receive(), ticker.next()).await {
+            Either::First(scan) => {
+                mapping.take_scan(scan);
+                scans.receive_done();
+                watchdog.pet();
+            }
+            Either::Second(()) => mapping.coast(),
+        }
+        // The lidar task lives and says that there is no sensor.
+        let reported = STATE.absences.load(Ordering::Relaxed);
+        if core::mem::replace(&mut absences, reported) != reported {
+            watchdog.pet();
+        }
+        mapping.report();
+        mapping.print_map();
+        #[cfg(feature = "hang")]
+        if Instant::now().as_secs() >= 20 {
+            defmt::error!("hanging, as this build is told to");
+            loop {
+                cortex_m::asm::nop();
+            }
+        }
+    }
+}
+
+struct Mapping {
+    keeper: Keeper,
+    tracer: Tracer,
+    next_status: Instant,
+    scans_at_status: u32,
+    last_took_us: u32,
+    busy_us: u64,
+    printing: Option<usize>,
+    coasting: bool,
+    dropped: u32,
+}
+
+impl Mapping {
+    fn new(keeper: Keeper, tracer: Tracer) -> Self {
+        Self {
+            keeper,
+            tracer,
+            next_status: Instant::now() + STATUS_EVERY,
+            scans_at_status: 0,
+            last_took_us: 0,
+            busy_us: 0,
+            printing: None,
+            coasting: false,
+            dropped: 0,
+        }
+    }
+
+    fn resume(&mut self) {
+        self.keeper.update(|mapper| mapper.resume());
+        self.tracer.event(Event::Resumed, 0, &[], self.keeper.mapper(), 0);
+        let pose = components(&self.keeper.mapper().slam().pose());
+        defmt::info!(
+            "the map of {=usize} segments is kept; last seen at x {=f32} m, y {=f32} m, heading {=f32} rad",
+            self.keeper.mapper().slam().map().segments().len(),
+            pose.x,
+            pose.y,
+            pose.z
+        );
+    }
+
+    fn take_scan(&mut self, scan: &ScanBuffer) {
+        let begin = Instant::now();
+        let Self { keeper, tracer, .. } = self;
+        let ranges_mm = scan.ranges_mm.get(..scan.len).unwrap_or(&[]);
+        let update = keeper.update(|mapper| {
+            while let Ok(ticks) = encoders::SAMPLES.try_receive() {
+                tracer.sample(ticks);
+                mapper.push(ticks);
+            }
+            mapper.scan(scan.middle_us, ranges_mm)
+        });
+        let took_us = begin.elapsed().as_micros() as u32;
+        self.last_took_us = took_us;
+        self.busy_us += u64::from(took_us);
+        self.tracer.event(Event::Scan, scan.middle_us, ranges_mm, self.keeper.mapper(), took_us);
+        if core::mem::take(&mut self.coasting) {
+            let sigmas = self.keeper.mapper().slam().covariance();
+            defmt::info!(
+                "scans again; sure within {=f32} m, {=f32} m, {=f32} rad (sigma)",
+                sigma(sigmas.m11),
+                sigma(sigmas.m22),
+                sigma(sigmas.m33)
+            );
+        }
+        match update {
+            None => defmt::warn!("a scan came without odometry, or late: {}", self.keeper.mapper().counters()),
+            Some(update) => {
+                if let Some(rejected) = update.rejected {
+                    defmt::warn!("a scan was not used: {}", rejected);
+                }
+                if update.closure.is_some() {
+                    defmt::info!("a loop was closed");
+                }
+            }
+        }
+        CONSOLE.signal(PoseLine::new(scan.middle_us, &self.keeper.mapper().slam().pose()));
+    }
+
+    fn coast(&mut self) {
+        let until_us = Instant::now().as_micros().saturating_sub(COAST_BEHIND_US);
+        let late = self.keeper.mapper().pose_us().is_none_or(|at| at < until_us);
+        // Samples wait in their queue as long as scans come in time.
+        if !late {
+            return;
+        }
+        let Self { keeper, tracer, .. } = self;
+        let moved = keeper.update(|mapper| {
+            while let Ok(ticks) = encoders::SAMPLES.try_receive() {
+                tracer.sample(ticks);
+                mapper.push(ticks);
+            }
+            mapper.coast(until_us)
+        });
+        self.tracer.event(Event::Coasted, until_us, &[], self.keeper.mapper(), 0);
+        if moved.is_some() && !core::mem::replace(&mut self.coasting, true) {
+            defmt::warn!("no scans; going on by odometry alone");
+        }
+    }
+
+    /// The status line, once a second, and what was dropped.
+    fn report(&mut self) {
+        let dropped = encoders::DROPPED.load(Ordering::Relaxed);
+        if core::mem::replace(&mut self.dropped, dropped) != dropped {
+            defmt::warn!("encoders: {=u32} samples dropped so far", dropped);
+        }
+        let now = Instant::now();
+        if now < self.next_status {
+            return;
+        }
+        let period_us = (STATUS_EVERY + (now - self.next_status)).as_micros();
+        self.next_status = now + STATUS_EVERY;
+        let slam = self.keeper.mapper().slam();
+        let (pose, covariance) = (components(&slam.pose()), slam.covariance());
+        let scans = STATE.scans.load(Ordering::Relaxed);
+        let new = scans.wrapping_sub(core::mem::replace(&mut self.scans_at_status, scans));
+        let permille = core::mem::take(&mut self.busy_us) * 1000 / period_us.max(1);
+        defmt::info!(
+            "x {=f32} y {=f32} heading {=f32}, sigma {=f32} {=f32} {=f32}, {=usize} segments, {=u32} scans in {=u64} ms, \
+             update {=u32} us, cpu {=u64} permille",
+            pose.x,
+            pose.y,
+            pose.z,
+            sigma(covariance.m11),
+            sigma(covariance.m22),
+            sigma(covariance.m33),
+            slam.map().segments().len(),
+            new,
+            period_us / 1000,
+            self.last_took_us,
+            permille
+        );
+        defmt::info!(
+            "lidar: missed {=u32}, dropped {=u32}, port errors {=u32}, losses {=u32}; {}; {}",
+            STATE.missed.load(Ordering::Relaxed),
+            STATE.dropped.load(Ordering::Relaxed),
+            STATE.port_errors.load(Ordering::Relaxed),
+            STATE.losses.load(Ordering::Relaxed),
+            slam.counters(),
+            self.keeper.mapper().counters()
+        );
+    }
+
+    /// A few segments of the map that was asked for, so that the log keeps up.
+    fn print_map(&mut self) {
+        if PRINT_MAP.swap(false, Ordering::Relaxed) {
+            defmt::info!("map: {=usize} segments", self.keeper.mapper().slam().map().segments().len());
+            self.printing = Some(0);
+        }
+        let Some(from) = self.printing else { return };
+        let map = self.keeper.mapper().slam().map().segments();
+        for entry in map.iter().skip(from).take(PRINT_AT_ONCE) {
+            let (a, b) = (entry.segment.start, entry.segment.end);
+            defmt::info!(
+                "segment {=f32} {=f32} {=f32} {=f32} points {=u32} scans {=u16}",
+                a.x,
+                a.y,
+                b.x,
+                b.y,
+                entry.segment.moments.inliers,
+                entry.hits
+            );
+        }
+        let next = from + PRINT_AT_ONCE;
+        self.printing = if next < map.len() {
+            Some(next)
+        } else {
+            defmt::info!("end of map");
+            None
+        };
+    }
+}

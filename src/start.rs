@@ -1,0 +1,79 @@
+//! Starts the board and spawns the tasks.
+
+use defmt_rtt as _;
+use embassy_executor::{InterruptExecutor, Spawner};
+use embassy_stm32::interrupt;
+use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
+use embassy_sync::zerocopy_channel::Channel;
+use slam_core::Slam;
+use static_cell::StaticCell;
+
+use crate::kept::{Found, Keeper, KeptTicks, Mapper, SEGMENTS};
+use crate::lidar::ScanBuffer;
+use crate::trace::Tracer;
+use crate::{board, console, encoders, faults, lidar, mapping, robot, signs};
+
+static URGENT: InterruptExecutor = InterruptExecutor::new();
+
+#[interrupt]
+unsafe fn UART5() {
+    // SAFETY: this is the executor's interrupt, and only it calls this.
+    unsafe { URGENT.on_interrupt() }
+}
+
+#[embassy_executor::main]
+async fn main(spawner: Spawner) {
+    let (mut board, cause) = board::start();
+    board.watchdog.unleash();
+    defmt::info!(
+        "lineslam {=str} on {=str}, robot {=str}; room for {=usize} segments, {=usize} bytes of map",
+        env!("CARGO_PKG_VERSION"),
+        board::NAME,
+        robot::NAME,
+        SEGMENTS,
+        Slam::<SEGMENTS>::BYTES
+    );
+    defmt::info!("reset by {}", cause);
+    faults::report();
+    let (keeper, found) = match Keeper::take() {
+        Ok(kept) => kept,
+        Err(error) => {
+            defmt::error!("the configuration cannot be used: {}", error);
+            return;
+        }
+    };
+    match found {
+        Found::Map => {}
+        _ => defmt::info!("a new map begins; kept memory: {}", found),
+    }
+    let ticks = KeptTicks::take(found != Found::Map);
+
+    static BUFFERS: StaticCell<[ScanBuffer; 2]> = StaticCell::new();
+    static SCANS: StaticCell<Channel<'static, CriticalSectionRawMutex, ScanBuffer>> = StaticCell::new();
+    let buffers = BUFFERS.init([ScanBuffer::EMPTY, ScanBuffer::EMPTY]);
+    let (sender, receiver) = SCANS.init(Channel::new(buffers)).split();
+
+    let urgent = URGENT.start(board::URGENT);
+    // Each task is spawned once, so there is room for it.
+    match (encoders::run(board.encoders, ticks), lidar::run(board.lidar, sender)) {
+        (Ok(encoders), Ok(lidar)) => {
+            urgent.spawn(encoders);
+            urgent.spawn(lidar);
+        }
+        _ => defmt::error!("an urgent task cannot be spawned"),
+    }
+    match (
+        mapping::run(keeper, found, Tracer::take(), receiver, board.watchdog),
+        signs::run(board.led, board.button),
+    ) {
+        (Ok(mapping), Ok(signs)) => {
+            spawner.spawn(mapping);
+            spawner.spawn(signs);
+        }
+        _ => defmt::error!("a task cannot be spawned"),
+    }
+    if let Some(Ok(console)) = board.console.open().map(console::run) {
+        spawner.spawn(console);
+    }
+    defmt::debug!("{=usize} bytes of map and odometry", Mapper::BYTES);
+}
