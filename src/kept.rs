@@ -1,8 +1,9 @@
 //! What a reset does not take: the map with the pose, and the wheels' ticks, in RAM that the start-up code leaves alone.
 //!
 //! The map is valid where its seal says so: a magic word, the checksum of this firmware's own code (another firmware
-//! lays memory out differently), and the checksum of the map itself. It is open while it is worked on, 2 to 3 % of the
-//! time; a reset in that time starts a new map. Power-up leaves noise, which no checksum fits.
+//! lays memory out differently), and the checksum of the map itself. While it is worked on it is open, with the seal of
+//! its last state; a reset in that time leaves it half done, and it is put in order. Power-up leaves noise, which no
+//! checksum fits.
 
 use core::mem::MaybeUninit;
 use core::ptr::{addr_of, addr_of_mut};
@@ -23,6 +24,8 @@ pub type Mapper = slam_core::Mapper<SEGMENTS, SAMPLES>;
 
 const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
 const MAGIC: u32 = 0x4C53_4C4D;
+const OPEN: u32 = 0x4F50_454E;
+const SEALED: u32 = 0x5345_414C;
 
 /// What happened to the map at start-up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
@@ -31,8 +34,8 @@ pub enum Found {
     Map,
     /// There is none: power-up, or another firmware ran.
     Nothing,
-    /// The last run was reset while it worked on the map.
-    Open,
+    /// The last run was reset while it worked on the map; what was whole of it is there.
+    HalfDone,
     /// Its checksum is wrong.
     Damaged,
 }
@@ -73,15 +76,21 @@ impl Keeper {
             let mapper = addr_of_mut!((*store).mapper);
             let found = if seal.magic != MAGIC || seal.firmware != firmware {
                 Found::Nothing
-            } else if seal.open != 0 {
-                Found::Open
+            } else if seal.open == OPEN {
+                Found::HalfDone
             } else if seal.checksum != checksum(mapper) {
                 Found::Damaged
             } else {
                 Found::Map
             };
-            if found != Found::Map {
-                *seal = Seal { magic: 0, firmware, open: 1, checksum: 0 };
+            // Half done, it is the mapper of this firmware all the same: each number in it has its old value, its new one
+            // or one on the way, and of each of them any bits are valid.
+            let found = match found {
+                Found::HalfDone if !(*mapper).assume_init_mut().recover() => Found::Damaged,
+                other => other,
+            };
+            if !matches!(found, Found::Map | Found::HalfDone) {
+                *seal = Seal { magic: 0, firmware, open: OPEN, checksum: 0 };
                 Mapper::new_in(&mut *mapper, robot::config(), robot::DRIVE)?;
             }
             let mut keeper = Self { seal, mapper: (*mapper).assume_init_mut() };
@@ -97,7 +106,7 @@ impl Keeper {
 
     /// Works on the map and seals it again.
     pub fn update<R>(&mut self, work: impl FnOnce(&mut Mapper) -> R) -> R {
-        self.seal.open = 1;
+        self.seal.open = OPEN;
         compiler_fence(Ordering::SeqCst);
         let result = work(self.mapper);
         compiler_fence(Ordering::SeqCst);
@@ -105,7 +114,7 @@ impl Keeper {
         self.seal.checksum = unsafe { checksum(core::ptr::from_mut(self.mapper).cast()) };
         self.seal.magic = MAGIC;
         compiler_fence(Ordering::SeqCst);
-        self.seal.open = 0;
+        self.seal.open = SEALED;
         result
     }
 }

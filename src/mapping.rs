@@ -42,8 +42,8 @@ pub async fn run(
     mut watchdog: IndependentWatchdog<'static, IWDG>,
 ) {
     let mut mapping = Mapping::new(keeper, tracer);
-    if found == Found::Map {
-        mapping.resume();
+    if matches!(found, Found::Map | Found::HalfDone) {
+        mapping.resume(found);
     }
     let mut ticker = Ticker::every(COAST_EVERY);
     let mut absences = STATE.absences.load(Ordering::Relaxed);
@@ -100,9 +100,16 @@ impl Mapping {
         }
     }
 
-    fn resume(&mut self) {
-        self.keeper.update(|mapper| mapper.resume());
-        self.tracer.event(Event::Resumed, 0, &[], self.keeper.mapper(), 0);
+    fn resume(&mut self, found: Found) {
+        let event = if found == Found::Map {
+            self.keeper.update(|mapper| mapper.resume());
+            Event::Resumed
+        } else {
+            // It was put in order when it was taken.
+            defmt::warn!("the reset came in the middle of a scan; what was whole of the map is there");
+            Event::Recovered
+        };
+        self.tracer.event(event, 0, &[], self.keeper.mapper(), 0);
         let pose = components(&self.keeper.mapper().slam().pose());
         defmt::info!(
             "the map of {=usize} segments is kept; last seen at x {=f32} m, y {=f32} m, heading {=f32} rad",

@@ -43,10 +43,10 @@ async fn main(spawner: Spawner) {
         }
     };
     match found {
-        Found::Map => {}
-        _ => defmt::info!("a new map begins; kept memory: {}", found),
+        Found::Map | Found::HalfDone => {}
+        Found::Nothing | Found::Damaged => defmt::info!("a new map begins; kept memory: {}", found),
     }
-    let ticks = KeptTicks::take(found != Found::Map);
+    let ticks = KeptTicks::take(!matches!(found, Found::Map | Found::HalfDone));
 
     static BUFFERS: StaticCell<[ScanBuffer; 2]> = StaticCell::new();
     static SCANS: StaticCell<Channel<'static, CriticalSectionRawMutex, ScanBuffer>> = StaticCell::new();

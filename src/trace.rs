@@ -21,6 +21,8 @@ pub enum Event {
     Scan = 2,
     /// The robot went on by odometry alone.
     Coasted = 3,
+    /// The firmware took up a kept map that a reset had left half done; what came before is not to be had.
+    Recovered = 4,
 }
 
 /// The record. Every field is of four or eight bytes, little-endian, without padding.

@@ -88,12 +88,18 @@ impl Fault {
         }
     }
 
+    /// What it is from the beginning, on the board.
+    pub fn prepare_board(&self, board: &mut Nucleo, seed: u64) {
+        if let Self::Line { per_million } = *self {
+            board.set_line_errors(per_million, per_million, seed);
+        }
+    }
+
     /// What it does at an instant of the grid.
     pub fn at(
         &self,
         now_us: u64,
         grid_us: u64,
-        seed: u64,
         session: &mut Session<Nucleo>,
         shared: &Shared,
         stop: Stop,
@@ -107,9 +113,6 @@ impl Fault {
                 if room.plugged {
                     room.urg.power_cycle(now_us);
                 }
-            }
-            Self::Line { per_million } if is_now(0) => {
-                session.board_mut().set_line_errors(per_million, per_million, seed);
             }
             Self::Reset { at_us } if is_now(at_us) => {
                 session.reset_by_pin(stop.at, stop.instruction_count, host);

@@ -16,6 +16,8 @@ const RING: u64 = 64;
 pub enum Event {
     /// A kept map was taken up.
     Resumed,
+    /// A kept map was taken up that a reset had left half done.
+    Recovered,
     /// A scan was taken in.
     Scan {
         /// Its middle beam on the firmware's clock.
@@ -61,6 +63,8 @@ pub struct Recorder {
     trace: u64,
     events: u64,
     samples_taken: u64,
+    /// Set by a reset, until the start-up code has cleared the record.
+    stale: bool,
     /// All so far.
     pub entries: Vec<Entry>,
 }
@@ -68,18 +72,19 @@ pub struct Recorder {
 impl Recorder {
     /// Of the record at this address.
     pub fn new(trace: u64) -> Self {
-        Self { trace, events: 0, samples_taken: 0, entries: Vec::new() }
+        Self { trace, events: 0, samples_taken: 0, stale: false, entries: Vec::new() }
     }
 
     /// The firmware has been reset: its record begins anew.
     pub fn restarted(&mut self) {
-        (self.events, self.samples_taken) = (0, 0);
+        (self.events, self.samples_taken, self.stale) = (0, 0, true);
     }
 
     /// Looks for a new event.
     pub fn look(&mut self, host: &mut dyn Host, now_us: u64) -> anyhow::Result<bool> {
         let events = host.read(self.trace + 4, Width::W32)?;
-        if events == self.events {
+        self.stale &= events != 0;
+        if events == self.events || self.stale {
             return Ok(false);
         }
         anyhow::ensure!(host.read(self.trace, Width::W32)? == LAYOUT, "the firmware's record has another layout");
@@ -104,6 +109,7 @@ impl Recorder {
         let float = |host: &mut dyn Host, k: u64| word(host, k).map(f32::from_bits);
         let event = match kind {
             1 => Event::Resumed,
+            4 => Event::Recovered,
             2 => {
                 let (from, len) = (u64::from(word(host, 0)?), u64::from(word(host, 1)?));
                 let mut ranges_mm = Vec::new();

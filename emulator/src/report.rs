@@ -196,11 +196,13 @@ pub fn config(robot: &Robot) -> SlamConfig {
 }
 
 /// Where a PC, fed the same ticks and scans, parts from the firmware: the entry and both poses. `None` if it never does.
+/// A reset in the middle of a scan leaves what no PC can know; the comparison ends there.
 pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Option<(usize, [f32; 3], [f32; 3])>> {
     let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
     // The sizes of `src/kept.rs`.
     let mut mapper = Box::new(Mapper::<512, 64>::new(config(robot), drive)?);
-    for (number, entry) in entries.iter().enumerate() {
+    let known = entries.iter().take_while(|e| e.event != Event::Recovered);
+    for (number, entry) in known.enumerate() {
         if entry.event == Event::Resumed {
             mapper.resume();
         }
@@ -208,7 +210,7 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
             mapper.push(*sample);
         }
         match &entry.event {
-            Event::Resumed => {}
+            Event::Resumed | Event::Recovered => {}
             Event::Scan { middle_us, ranges_mm, .. } => drop(mapper.scan(*middle_us, ranges_mm)),
             Event::Coasted { until_us } => drop(mapper.coast(*until_us)),
         }

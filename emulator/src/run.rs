@@ -95,7 +95,10 @@ pub fn run(plan: &Plan<'_>, progress: impl FnMut(Progress) + Send + 'static) -> 
         fault.prepare(&mut room, plan.seed);
     }
     let shared: Shared = Arc::new(Mutex::new(room));
-    let board = Nucleo::new(shared.clone())?;
+    let mut board = Nucleo::new(shared.clone())?;
+    for fault in &plan.faults {
+        fault.prepare_board(&mut board, plan.seed);
+    }
     let session = Session::new(Box::new(board), 0, VirtualNanos(GRID_US * 1000))?;
     let driver = Director {
         shared,
@@ -105,7 +108,6 @@ pub fn run(plan: &Plan<'_>, progress: impl FnMut(Progress) + Send + 'static) -> 
         edges: VecDeque::new(),
         grid_us: 0,
         faults: plan.faults.clone(),
-        seed: plan.seed,
         limit_us: plan.seconds.map_or(u64::MAX, |s| s * 1_000_000),
         rested_us: None,
         pressed_us: None,
@@ -153,7 +155,6 @@ struct Director {
     edges: VecDeque<Edge>,
     grid_us: u64,
     faults: Vec<Fault>,
-    seed: u64,
     limit_us: u64,
     rested_us: Option<u64>,
     pressed_us: Option<u64>,
@@ -255,7 +256,7 @@ impl Director {
         })?;
         self.edges.extend(edges);
         for fault in self.faults.clone() {
-            fault.at(now_us, GRID_US, self.seed, session, &self.shared, stop, host)?;
+            fault.at(now_us, GRID_US, session, &self.shared, stop, host)?;
         }
         let led = session.board_mut().led();
         self.led_changes += u32::from(std::mem::replace(&mut self.led, led) != led);

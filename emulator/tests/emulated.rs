@@ -89,16 +89,25 @@ fn a_sensor_that_streams_at_another_bit_rate_is_taken_over() {
 
 #[test]
 fn a_reset_by_pin_while_driving_keeps_map_and_pose() {
-    let (outcome, judged) = hall(Some(50), &["reset@25.0373"]);
-    assert_eq!(outcome.resets.len(), 1);
-    assert!(says(&outcome, "INFO", "reset by Pin"));
-    assert!(says(&outcome, "INFO", "is kept"));
-    assert!(outcome.entries.iter().any(|e| e.event == Event::Resumed));
-    assert!(last_error_m(&judged) < 0.10, "{}", last_error_m(&judged));
-    // The map goes on: more segments than it would have after half the drive.
-    let before = outcome.entries.iter().rev().find(|e| e.read_us < 25_000_000).unwrap().segments;
-    assert!(outcome.entries.last().unwrap().segments + 5 >= before);
-    assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None);
+    let mut half_done = 0;
+    // Over one period of the scans: between two of them, and in the middle of the work on one.
+    for at in ["25.00", "25.02", "25.04", "25.06", "25.08"] {
+        let (outcome, judged) = hall(Some(40), &[&format!("reset@{at}")]);
+        assert_eq!(outcome.resets.len(), 1, "{at}");
+        assert!(says(&outcome, "INFO", "reset by Pin"), "{at}");
+        assert!(says(&outcome, "INFO", "is kept"), "{at}");
+        let recovered = outcome.entries.iter().any(|e| e.event == Event::Recovered);
+        let resumed = outcome.entries.iter().any(|e| e.event == Event::Resumed);
+        assert!(recovered != resumed, "{at}");
+        half_done += usize::from(recovered);
+        assert!(last_error_m(&judged) < 0.10, "{at}: {}", last_error_m(&judged));
+        assert!(judged.report.worst_position_error_m < 0.15, "{at}: {}", judged.report.worst_position_error_m);
+        // The map goes on where it was.
+        let before = outcome.entries.iter().rev().find(|e| e.read_us < 25_000_000).unwrap().segments;
+        assert!(outcome.entries.last().unwrap().segments + 5 >= before, "{at}");
+        assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None, "{at}");
+    }
+    assert!((1..5).contains(&half_done), "{half_done} of 5 in the middle of the work");
 }
 
 #[test]

@@ -87,6 +87,19 @@ impl Joint {
         }
     }
 
+    /// Lets go of all lines and begins with a pose that is sure, and with the odometry's errors as they are known, as
+    /// unsure as these standard deviations say.
+    pub(crate) fn clear(&mut self, sigma_odometry: Vector3<f32>) {
+        self.covariance.fill(0.0);
+        self.owners.fill(None);
+        self.ages_scans.fill(f32::INFINITY);
+        self.shift.fill(0.0);
+        if !self.bias.0.iter().all(|v| v.is_finite()) {
+            self.bias = OdometryBias::default();
+        }
+        self.prepare(sigma_odometry);
+    }
+
     /// The odometry's errors as known so far.
     pub fn bias(&self) -> OdometryBias {
         self.bias

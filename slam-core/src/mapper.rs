@@ -29,6 +29,8 @@ pub struct WheelTicks {
 /// Standard deviations (m, m, rad) of what a robot may do unseen while its microcontroller is reset: some milliseconds at
 /// 1 m/s, and a wheel's slip. Chosen, not measured.
 pub const UNSEEN: [f32; 3] = [0.02, 0.02, 0.02];
+/// The same where the reset came in the middle of a scan, and what the pose had in common with the walls is lost.
+pub const UNSEEN_IN_WORK: [f32; 3] = [0.05, 0.05, 0.05];
 
 /// What happened to the odometry since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -54,7 +56,7 @@ pub struct Mapper<const N: usize, const K: usize> {
     /// The instant of the pose.
     pose_us: Option<u64>,
     /// Set while the time of the next sample has nothing to do with that of the last.
-    resuming: bool,
+    resuming: Option<[f32; 3]>,
     counters: MapperCounters,
 }
 
@@ -90,7 +92,7 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
             track: OdometryTrack::default(),
             last_ticks: None,
             pose_us: None,
-            resuming: false,
+            resuming: None,
             counters: MapperCounters::default(),
         }
     }
@@ -125,10 +127,10 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
             ),
             None => self.drive.increment(0, 0, self.slam.config().odometry.integration),
         };
-        if core::mem::take(&mut self.resuming) {
+        if let Some(unseen) = self.resuming.take() {
             // Across the reset: what the wheels counted, and what they may have done unseen.
             self.slam.coast(&step);
-            let sigmas = Vector3::from(UNSEEN);
+            let sigmas = Vector3::from(unseen);
             self.slam.loosen(&Matrix3::from_diagonal(&sigmas.component_mul(&sigmas)));
             self.track = OdometryTrack::default();
             self.pose_us = None;
@@ -168,10 +170,18 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
         Some(self.slam.coast(&motion))
     }
 
+    /// The same after a reset that came in the middle of any of the other calls. False where nothing can be kept.
+    pub fn recover(&mut self) -> bool {
+        let kept = self.slam.recover();
+        self.resume();
+        self.resuming = Some(UNSEEN_IN_WORK);
+        kept
+    }
+
     /// Takes up the map again after a reset: the clock has begun anew, the wheels' ticks go on from where they were last
     /// known, and the robot may have moved unseen, by [`UNSEEN`].
     pub fn resume(&mut self) {
-        self.resuming = true;
+        self.resuming = Some(UNSEEN);
         self.counters.resumed = self.counters.resumed.saturating_add(1);
     }
 }
@@ -237,6 +247,26 @@ mod tests {
         let grown = mapper.slam().covariance() - before.1;
         assert!(grown.m11 > 3.9e-4 && grown.m33 > 3.9e-4, "{grown}");
         assert_eq!(mapper.counters().resumed, 1);
+    }
+
+    #[test]
+    fn a_reset_in_the_middle_of_a_scan_keeps_what_is_whole() {
+        let mut mapper = mapper();
+        for k in 0..100 {
+            mapper.push(ticks(k));
+        }
+        for scan in 0..3 {
+            mapper.scan(200_000 + 100_000 * scan, &[1500; 682]).unwrap();
+        }
+        let segments = mapper.slam().map().segments().len();
+        assert!(segments > 3);
+        assert!(mapper.recover());
+        mapper.push(WheelTicks { stamp_us: 7, ..ticks(110) });
+        assert_eq!(mapper.slam().map().segments().len(), segments);
+        assert!(mapper.slam().covariance().m11 > 24e-4);
+        // And it goes on.
+        mapper.push(WheelTicks { stamp_us: 100_007, ..ticks(111) });
+        assert!(mapper.scan(60_000, &[1500; 682]).unwrap().corrected);
     }
 
     #[test]

@@ -176,7 +176,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// What depends on the configuration.
     pub(crate) fn prepare(&mut self) {
         if matches!(self.config.registration, RegistrationConfig::Joint(_)) {
-            let sigmas = self.config.odometry.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas());
+            let sigmas = self.odometry_sigmas();
             self.joint.insert(Joint::blank()).prepare(sigmas);
         }
         fill_bearings(&self.config.sensor, &mut self.bearings);
@@ -279,6 +279,32 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if let Some(joint) = &mut self.joint {
             joint.loosen_pose(by, &mut self.map);
         }
+    }
+
+    /// Puts in order what a reset in the middle of [`Self::process_scan`] may have left half done. Segments that are not finite leave
+    /// the map, and the joint estimate begins anew with what the map says. False where the pose is lost: nothing can be
+    /// kept then.
+    pub fn recover(&mut self) -> bool {
+        if !is_finite(&self.map_from_base) || !self.local_covariance.iter().all(|v| v.is_finite()) {
+            return false;
+        }
+        let c = components(&self.map_from_base);
+        self.map_from_base = pose(c.x, c.y, c.z);
+        for index in (0..self.map.segments().len()).rev() {
+            if self.map.segments().get(index).is_some_and(|entry| !entry.segment.is_finite()) {
+                self.map.forget(index);
+            }
+        }
+        let sigmas = self.odometry_sigmas();
+        if let Some(joint) = &mut self.joint {
+            joint.clear(sigmas);
+        }
+        self.closing = PendingClosure::default();
+        true
+    }
+
+    fn odometry_sigmas(&self) -> Vector3<f32> {
+        self.config.odometry.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas())
     }
 
     /// Eq. (1) with covariance: where the odometry says the base is.
