@@ -145,7 +145,9 @@ impl Mapping {
             );
         }
         match update {
-            None => defmt::warn!("a scan came without odometry, or late: {}", self.keeper.mapper().counters()),
+            None => {
+                defmt::warn!("a scan came without odometry, or late: {}", self.keeper.mapper().counters())
+            }
             Some(update) => {
                 if let Some(rejected) = update.rejected {
                     defmt::warn!("a scan was not used: {}", rejected);

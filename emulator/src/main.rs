@@ -164,10 +164,20 @@ fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
     let [median, p99, max] = r.update_us.map(|us| f64::from(us) * 1e-3);
     let rows = [
         ("world", format!("{}, seed {}", r.world, r.seed)),
-        ("driven", format!("{:.0} s of virtual time{}", r.virtual_s, if r.arrived { "" } else { ", not to the end" })),
+        (
+            "driven",
+            format!(
+                "{:.0} s of virtual time{}",
+                r.virtual_s,
+                if r.arrived { "" } else { ", not to the end" }
+            ),
+        ),
         ("scans", format!("{} sent, {} used", r.scans_sent, r.scans_used)),
         ("corner error, eq. (11)", corners),
-        ("trajectory error, rmse", format!("{:.3} m, at worst {:.3} m", r.trajectory.ate_rmse_m, r.worst_position_error_m)),
+        (
+            "trajectory error, rmse",
+            format!("{:.3} m, at worst {:.3} m", r.trajectory.ate_rmse_m, r.worst_position_error_m),
+        ),
         ("map", format!("{} segments", r.segments)),
         ("a scan on the microcontroller", format!("median {median:.2} ms, p99 {p99:.2} ms, max {max:.2} ms")),
         ("of the processor's time", format!("{:.1} %", 100.0 * r.cpu_share)),

@@ -87,7 +87,10 @@ impl Recorder {
         if events == self.events || self.stale {
             return Ok(false);
         }
-        anyhow::ensure!(host.read(self.trace, Width::W32)? == LAYOUT, "the firmware's record has another layout");
+        anyhow::ensure!(
+            host.read(self.trace, Width::W32)? == LAYOUT,
+            "the firmware's record has another layout"
+        );
         anyhow::ensure!(events == self.events + 1, "{} events at once", events.wrapping_sub(self.events));
         self.events = events;
         let kind = host.read(self.trace + 8, Width::W32)?;

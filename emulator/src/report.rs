@@ -71,7 +71,11 @@ pub struct Judged {
 /// Judges a run.
 pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judged> {
     let map = printed_map(outcome)?;
-    let mut drive = Drive { log: Log { format: "mines", ..Log::default() }, truth: Vec::new(), true_wheels: ([0.0; 2], 0.0) };
+    let mut drive = Drive {
+        log: Log { format: "mines", ..Log::default() },
+        truth: Vec::new(),
+        true_wheels: ([0.0; 2], 0.0),
+    };
     let mut poses = Vec::new();
     let mut took: Vec<u32> = Vec::new();
     let mut late_us: Vec<i64> = Vec::new();
@@ -94,7 +98,8 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
     }
     let corners = judge::corner_errors(world, &drive, &map);
     let in_world = judge::in_world(&drive, poses.iter().copied());
-    let off = |(t, p): (&Isometry2<f64>, &Isometry2<f64>)| (t.translation.vector - p.translation.vector).norm();
+    let off =
+        |(t, p): (&Isometry2<f64>, &Isometry2<f64>)| (t.translation.vector - p.translation.vector).norm();
     let busy_us: u64 = took.iter().map(|t| u64::from(*t)).sum();
     took.sort_unstable();
     let share = |q: usize| took.get((took.len().saturating_sub(1)) * q / 100).copied().unwrap_or(0);
@@ -195,9 +200,20 @@ pub fn config(robot: &Robot) -> SlamConfig {
     config
 }
 
-/// Where a PC, fed the same ticks and scans, parts from the firmware: the entry and both poses. `None` if it never does.
+/// Where a PC and the firmware part.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Difference {
+    /// The entry after which they differ.
+    pub entry: usize,
+    /// x, y, θ on the PC.
+    pub here: [f32; 3],
+    /// x, y, θ on the board.
+    pub board: [f32; 3],
+}
+
+/// Where a PC, fed the same ticks and scans, parts from the firmware: `None` if it never does.
 /// A reset in the middle of a scan leaves what no PC can know; the comparison ends there.
-pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Option<(usize, [f32; 3], [f32; 3])>> {
+pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Option<Difference>> {
     let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
     // The sizes of `src/kept.rs`.
     let mut mapper = Box::new(Mapper::<512, 64>::new(config(robot), drive)?);
@@ -218,7 +234,7 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
         let same = (0..3).all(|i| here[i].to_bits() == entry.pose[i].to_bits())
             && mapper.slam().map().segments().len() == entry.segments as usize;
         if !same {
-            return Ok(Some((number, here.into(), entry.pose.into())));
+            return Ok(Some(Difference { entry: number, here: here.into(), board: entry.pose.into() }));
         }
     }
     Ok(None)

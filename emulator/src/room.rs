@@ -64,7 +64,8 @@ impl Building {
         let mut world = world.clone();
         world.path.pause_s = world.path.pause_s.max(PAUSE_S);
         // 32 bits, so that differences never wrap here; the timers' own 16 do.
-        let mut wheels = robot.wheels.ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
+        let mut wheels =
+            robot.wheels.ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
         wheels.counter_bits = 32;
         let mut config = SlamConfig::default();
         robot.apply(&mut config, robot.beams().unwrap_or(scip::sim::BEAMS), None);

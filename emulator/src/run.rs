@@ -208,7 +208,8 @@ impl Director {
         host: &mut dyn Host,
     ) -> anyhow::Result<Option<VirtualNanos>> {
         let now_ns = stop.at.0;
-        while let Some(edge) = self.edges.pop_front_if(|e| e.at_ns <= now_ns) {
+        while let Some(&edge) = self.edges.front().filter(|e| e.at_ns <= now_ns) {
+            self.edges.pop_front();
             session.board_mut().drive_encoder(stop.at, edge.side, edge.levels);
         }
         if now_ns / 1000 >= self.grid_us {
@@ -264,12 +265,7 @@ impl Director {
     }
 
     /// Lets the base rest, presses the button, and waits for the map.
-    fn is_over(
-        &mut self,
-        session: &mut Session<Nucleo>,
-        stop: Stop,
-        now_us: u64,
-    ) -> anyhow::Result<bool> {
+    fn is_over(&mut self, session: &mut Session<Nucleo>, stop: Stop, now_us: u64) -> anyhow::Result<bool> {
         let arrived = self.room(|room| room.building.arrived())?;
         if self.rested_us.is_none() && arrived {
             self.rested_us = Some(now_us + REST_US);

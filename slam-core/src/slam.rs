@@ -1,7 +1,7 @@
 //! The only stateful wiring: a scan and a motion go in, a pose and a map come out.
 
-use heapless::Vec;
 use core::mem::MaybeUninit;
+use heapless::Vec;
 
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 

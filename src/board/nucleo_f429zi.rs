@@ -163,15 +163,8 @@ impl LidarPins {
     /// Opens the port. `None` if the bit rate cannot be made, which it can.
     pub fn open(self) -> Option<LidarPort> {
         static BUFFER: StaticCell<[u8; RING]> = StaticCell::new();
-        let uart = Uart::new(
-            self.usart,
-            self.rx,
-            self.tx,
-            self.tx_dma,
-            self.rx_dma,
-            Irqs,
-            usart::Config::default(),
-        );
+        let uart =
+            Uart::new(self.usart, self.rx, self.tx, self.tx_dma, self.rx_dma, Irqs, usart::Config::default());
         let (tx, rx) = uart.ok()?.split();
         Some(LidarPort { tx, rx: rx.into_ring_buffered(BUFFER.init([0; RING])) })
     }

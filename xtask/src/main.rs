@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 mod bench;
+mod firmware;
 mod run;
 mod size;
 mod test;
@@ -9,6 +10,7 @@ mod test;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use firmware::Build;
 
 /// The target of the firmware.
 pub const TARGET: &str = "thumbv7em-none-eabihf";
@@ -25,7 +27,22 @@ struct Cli {
 enum Task {
     /// Everything CI runs: format, clippy for host and target, docs, sizes, costs, all tests.
     Test,
-    /// Flash and RAM of the driver on the microcontroller.
+    /// The hall, driven round and mapped by the firmware on an emulated board; needs no hardware.
+    Demo,
+    /// Run the firmware on an emulated board in a simulated building.
+    #[command(disable_help_flag = true)]
+    Emulate {
+        /// What the emulator takes; `--help` shows it.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENTS")]
+        arguments: Vec<String>,
+    },
+    /// Build the firmware, for the robot that LINESLAM_ROBOT names or robots/paper.toml.
+    Firmware,
+    /// Build the firmware, flash it with probe-rs, and show its log.
+    Flash,
+    /// Show the log of the firmware that runs, with probe-rs.
+    Attach,
+    /// Flash and RAM of the firmware by section and crate, against the budget, and of the sensor's driver alone.
     Size,
     /// Instructions that decoding a scan takes, counted by callgrind.
     Bench,
@@ -34,6 +51,11 @@ enum Task {
 fn main() -> ExitCode {
     let done = match Cli::parse().task {
         Task::Test => test::everything(),
+        Task::Demo => firmware::demo(),
+        Task::Emulate { arguments } => firmware::emulate(&arguments),
+        Task::Firmware => firmware::build(Build::Flashed).map(|elf| println!("{}", elf.display())),
+        Task::Flash => firmware::flash(),
+        Task::Attach => firmware::attach(),
         Task::Size => size::report(),
         Task::Bench => bench::report(),
     };

@@ -1,40 +1,72 @@
-//! `cargo xtask size`: flash and RAM on the microcontroller, read from what the linker made.
+//! `cargo xtask size`: flash and RAM on the microcontroller, read from what the linker made, against a budget.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use object::{File, Object, ObjectSection, ObjectSymbol, SectionKind, SymbolKind};
 
 use crate::TARGET;
-use crate::run::{cargo, ensure_target, root, step};
+use crate::firmware::{self, Build};
+use crate::run::{announce, cargo, root, step};
+
+/// Flash that the firmware may take: code, constants, and what variables begin with.
+const FLASH_BUDGET: u64 = 224 * 1024;
+/// RAM that its variables may take, the map for 512 segments among them; the rest of the board's 192 KiB is stack.
+const RAM_BUDGET: u64 = 96 * 1024;
 
 /// What a report prints of an ELF file.
 struct Sizes {
     /// Bytes of code by the crate that its symbol names.
     code_by_crate: BTreeMap<String, u64>,
-    code: u64,
-    constants: u64,
+    /// Sections that take flash or RAM: name, bytes, and whether flash holds them, and RAM.
+    sections: Vec<(String, u64, bool, bool)>,
     /// Statics named `RAM_…`.
     ram: BTreeMap<String, u64>,
 }
 
-/// Links the driver alone and prints its size.
+/// Prints the firmware's size and that of the driver alone, and fails over the budget.
 pub fn report() -> anyhow::Result<()> {
-    ensure_target()?;
-    let command = format!("build --quiet --release -p footprint --target {TARGET}");
-    step("size of the driver alone", &mut cargo(&command))?;
-    let elf = root().join("target").join(TARGET).join("release/footprint");
-    let sizes = read(&elf)?;
-    println!("{:>8} bytes of code, the compiler's own functions and the probe included", sizes.code);
-    for (name, bytes) in &sizes.code_by_crate {
-        println!("{bytes:>8}   in {name}");
+    let elf = firmware::build(Build::Flashed)?;
+    let firmware = read(&elf)?;
+    announce("size of the firmware, bytes");
+    println!("{:<14} {:>9} {:>9}", "section", "flash", "RAM");
+    let shown = |there: bool, bytes: u64| if there { bytes.to_string() } else { String::new() };
+    for (name, bytes, flash, ram) in &firmware.sections {
+        println!("{name:<14} {:>9} {:>9}", shown(*flash, *bytes), shown(*ram, *bytes));
     }
-    println!("{:>8} bytes of constants, the RAM below not counted", sizes.constants);
-    for (name, bytes) in &sizes.ram {
-        println!("{bytes:>8} bytes of RAM: {}", what(name));
+    let sum = |of: fn(&(String, u64, bool, bool)) -> bool| {
+        firmware.sections.iter().filter(|s| of(s)).map(|s| s.1).sum::<u64>()
+    };
+    let (flash, ram) = (sum(|s| s.2), sum(|s| s.3));
+    println!("{:<14} {flash:>9} {ram:>9}", "sum");
+    println!("{:<14} {FLASH_BUDGET:>9} {RAM_BUDGET:>9}", "budget");
+    println!("\ncode by crate:");
+    for (name, bytes) in largest(&firmware.code_by_crate) {
+        println!("{bytes:>9} {name}");
+    }
+
+    let command = format!("build --quiet --release -p footprint --target {TARGET}");
+    step("size of the sensor's driver alone, bytes", &mut cargo(&command))?;
+    let driver = read(&root().join("target").join(TARGET).join("release/footprint"))?;
+    for (name, bytes) in largest(&driver.code_by_crate) {
+        println!("{bytes:>9} of code in {name}");
+    }
+    for (name, bytes) in &driver.ram {
+        println!("{bytes:>9} of RAM: {}", what(name));
+    }
+    if flash > FLASH_BUDGET || ram > RAM_BUDGET {
+        bail!("the firmware is over its budget");
     }
     Ok(())
+}
+
+/// The largest first.
+fn largest(by_crate: &BTreeMap<String, u64>) -> Vec<(&String, &u64)> {
+    let mut all: Vec<_> = by_crate.iter().collect();
+    all.sort_by_key(|(_, bytes)| std::cmp::Reverse(**bytes));
+    all.truncate(14);
+    all
 }
 
 fn what(name: &str) -> &str {
@@ -49,15 +81,17 @@ fn what(name: &str) -> &str {
 fn read(elf: &Path) -> anyhow::Result<Sizes> {
     let bytes = std::fs::read(elf).with_context(|| elf.display().to_string())?;
     let file = File::parse(&*bytes).with_context(|| elf.display().to_string())?;
-    let of_kinds = |kinds: &[SectionKind]| {
-        file.sections().filter(|s| kinds.contains(&s.kind())).map(|s| s.size()).sum::<u64>()
-    };
-    let mut sizes = Sizes {
-        code_by_crate: BTreeMap::new(),
-        code: of_kinds(&[SectionKind::Text]),
-        constants: of_kinds(&[SectionKind::ReadOnlyData, SectionKind::ReadOnlyString]),
-        ram: BTreeMap::new(),
-    };
+    let mut sizes = Sizes { code_by_crate: BTreeMap::new(), sections: Vec::new(), ram: BTreeMap::new() };
+    for section in file.sections().filter(|s| s.size() > 0) {
+        let (flash, ram) = match section.kind() {
+            SectionKind::Text | SectionKind::ReadOnlyData | SectionKind::ReadOnlyString => (true, false),
+            // Variables that begin with a value have it in flash.
+            SectionKind::Data => (true, true),
+            SectionKind::UninitializedData => (false, true),
+            _ => continue,
+        };
+        sizes.sections.push((section.name().unwrap_or("?").to_owned(), section.size(), flash, ram));
+    }
     for symbol in file.symbols().filter(|s| s.size() > 0) {
         let name = symbol.name().unwrap_or("?");
         match symbol.kind() {
@@ -66,8 +100,6 @@ fn read(elf: &Path) -> anyhow::Result<Sizes> {
             }
             SymbolKind::Data if name.starts_with("RAM_") => {
                 sizes.ram.insert(name.to_owned(), symbol.size());
-                // It lies among the constants, for it is never written.
-                sizes.constants = sizes.constants.saturating_sub(symbol.size());
             }
             _ => {}
         }

@@ -7,60 +7,76 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail};
 
 use crate::run::{announce, cargo, ensure_target, program, root, step};
-use crate::{TARGET, bench, size};
+use crate::{TARGET, bench, firmware, size};
 
 /// Runs every check, cheapest first; the tests come last and close with their sum.
 pub fn everything() -> anyhow::Result<()> {
     ensure_target()?;
     step("format", &mut cargo("fmt --all --check"))?;
-    step("clippy, host", &mut cargo("clippy --workspace --all-targets -- -D warnings"))?;
+    step("clippy, host", &mut cargo("clippy --workspace --exclude emulator --all-targets -- -D warnings"))?;
+    let emulator = "clippy --release -p emulator --all-targets --ignore-rust-version -- -D warnings";
+    step("clippy, emulator", &mut cargo(emulator))?;
     for arguments in [
         "-p slam-core",
         "-p slam-core --features defmt,serde",
         "-p scip",
         "-p scip --all-features",
         "-p footprint",
+        "-p firmware",
+        "-p firmware --features hang,sleeps",
     ] {
         let command = format!("clippy {arguments} --target {TARGET} -- -D warnings");
         step(&format!("clippy for {TARGET}: {arguments}"), &mut cargo(&command))?;
     }
     let features = "slam-core/defmt,slam-core/serde,scip/defmt,scip/embassy-time,scip/sim,scip/slam-core";
-    let mut docs = cargo(&format!("doc --workspace --no-deps --features {features}"));
+    let mut docs = cargo(&format!(
+        "doc --workspace --exclude emulator --exclude firmware --no-deps --features {features}"
+    ));
     step("docs", docs.env("RUSTDOCFLAGS", "-D warnings"))?;
     size::report()?;
     bench::report()?;
     let python = referee_python();
-    tests(python)
+    let elves = firmware::for_tests()?;
+    tests(python, &elves)
 }
 
-/// Runs all tests and adds up what the test runner says.
-fn tests(python: Option<PathBuf>) -> anyhow::Result<()> {
+/// Runs all tests and adds up what the test runner says. The emulated runs are built with optimisations, the others are not.
+fn tests(python: Option<PathBuf>, elves: &[(&str, PathBuf)]) -> anyhow::Result<()> {
+    let mut sum = Sum::default();
     announce("tests");
-    let mut command = cargo("test --workspace --no-fail-fast");
+    let mut command = cargo("test --workspace --exclude emulator --no-fail-fast");
     if let Some(python) = python {
         command.env("LINESLAM_PYTHON", python);
     }
-    let mut child = command.stdout(Stdio::piped()).spawn().context("cannot run cargo test")?;
-    let mut sum = Sum::default();
-    let mut out = std::io::stdout();
-    for line in BufReader::new(child.stdout.take().context("the tests' output")?).lines() {
-        let line = line.context("the tests' output")?;
-        writeln!(out, "{line}")?;
-        sum.take(&line);
-    }
-    let status = child.wait()?;
+    let on_the_pc = run_tests(&mut command, &mut sum)?;
+    announce("tests on the emulated board");
+    let mut command = cargo("test --release -p emulator --ignore-rust-version --no-fail-fast");
+    command.envs(elves.iter().map(|(name, path)| (name, path)));
+    let emulated = run_tests(&mut command, &mut sum)?;
     println!();
     for skipped in &sum.skipped {
         println!("{skipped}");
     }
     println!("{} passed, {} failed, {} skipped", sum.passed, sum.failed, sum.skipped.len());
-    if !status.success() || sum.failed > 0 {
+    if !on_the_pc || !emulated || sum.failed > 0 {
         bail!("tests failed");
     }
     if sum.passed == 0 {
         bail!("no test ran");
     }
     Ok(())
+}
+
+/// Shows what a test run prints and takes its sums. True if it succeeded.
+fn run_tests(command: &mut Command, sum: &mut Sum) -> anyhow::Result<bool> {
+    let mut child = command.stdout(Stdio::piped()).spawn().context("cannot run cargo test")?;
+    let mut out = std::io::stdout();
+    for line in BufReader::new(child.stdout.take().context("the tests' output")?).lines() {
+        let line = line.context("the tests' output")?;
+        writeln!(out, "{line}")?;
+        sum.take(&line);
+    }
+    Ok(child.wait()?.success())
 }
 
 #[derive(Default)]

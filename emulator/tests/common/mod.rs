@@ -15,13 +15,15 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The firmware's ELF, which `cargo xtask firmware` builds; `LINESLAM_FIRMWARE` and `LINESLAM_FIRMWARE_HANG` name others.
-pub fn elf(hang: bool) -> PathBuf {
-    let (variable, folder) =
-        if hang { ("LINESLAM_FIRMWARE_HANG", "target/hang") } else { ("LINESLAM_FIRMWARE", "target") };
-    let usual = root().join(folder).join("thumbv7em-none-eabihf/release/firmware");
+/// A build of the firmware, which `cargo xtask test` makes and names by these variables.
+pub fn elf(build: &str) -> PathBuf {
+    let variable = match build {
+        "lineslam" => "LINESLAM_FIRMWARE".to_owned(),
+        other => format!("LINESLAM_FIRMWARE_{}", other.to_uppercase()),
+    };
+    let usual = root().join("target/firmware").join(format!("{build}.elf"));
     let elf = std::env::var_os(variable).map_or(usual, PathBuf::from);
-    assert!(elf.exists(), "{} is not there: run `cargo xtask test`, which builds it", elf.display());
+    assert!(elf.exists(), "{} is not there: `cargo xtask test` builds it", elf.display());
     elf
 }
 
@@ -35,13 +37,14 @@ pub fn world(name: &str) -> World {
 
 /// Runs the hall for a while, with these faults.
 pub fn hall(seconds: Option<u64>, faults: &[&str]) -> (Outcome, Judged) {
-    run_in("hall", seconds, faults, false)
+    run_in("lineslam", seconds, faults)
 }
 
-pub fn run_in(name: &str, seconds: Option<u64>, faults: &[&str], hang: bool) -> (Outcome, Judged) {
-    let (world, robot, seed) = (world(name), robot(), 11);
+/// Runs a build of the firmware in the hall.
+pub fn run_in(build: &str, seconds: Option<u64>, faults: &[&str]) -> (Outcome, Judged) {
+    let (world, robot, seed) = (world("hall"), robot(), 11);
     let faults = faults.iter().map(|f| f.parse::<Fault>().expect("a fault")).collect();
-    let elf = elf(hang);
+    let elf = elf(build);
     let plan =
         Plan { elf: &elf, world: &world, robot: &robot, sim: SimConfig::default(), seed, seconds, faults };
     let outcome = run(&plan, |_| ()).unwrap_or_else(|error| panic!("{error:#}"));

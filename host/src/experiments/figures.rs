@@ -23,7 +23,10 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
         drive.truth.iter().map(|pose| nalgebra::convert_unchecked(map_from_world * pose)).collect();
     let title = format!("{}, seed {seed}", world.name);
     let draw = |replay: &Replay, subtitle: &str| {
-        svg::render(&replay.into(), &Scene { title: &title, subtitle, blueprint: &blueprint, reference: &truth })
+        svg::render(
+            &replay.into(),
+            &Scene { title: &title, subtitle, blueprint: &blueprint, reference: &truth },
+        )
     };
     let mut figures = vec![(format!("{}.svg", world.name), draw(&replay, "default configuration"))];
     if world.name == "hall" {

@@ -1,0 +1,117 @@
+//! The firmware: built, flashed, and run on the emulated board.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+
+use crate::TARGET;
+use crate::run::{cargo, ensure_target, program, root, step};
+
+/// What probe-rs calls the default board's chip.
+const CHIP: &str = "STM32F429ZITx";
+/// Where finished ELF files are put, under the target folder.
+const ELF_FOLDER: &str = "firmware";
+
+/// A build of the firmware.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Build {
+    /// The one that is flashed.
+    Flashed,
+    /// Stops processing after a while, for the test of the watchdog.
+    Hanging,
+    /// Sleeps a thousand times and says how late it woke, for the test of the emulated time driver.
+    Sleeping,
+}
+
+impl Build {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Flashed => "lineslam",
+            Self::Hanging => "hang",
+            Self::Sleeping => "sleeps",
+        }
+    }
+
+    fn features(self) -> &'static str {
+        match self {
+            Self::Flashed => "",
+            Self::Hanging => "--features hang",
+            Self::Sleeping => "--features sleeps",
+        }
+    }
+}
+
+/// Builds the firmware and returns its ELF file. The robot file is `robots/paper.toml` unless `LINESLAM_ROBOT` names one.
+pub fn build(build: Build) -> anyhow::Result<PathBuf> {
+    ensure_target()?;
+    let mut command =
+        cargo(&format!("build --quiet --release -p firmware --target {TARGET} {}", build.features()));
+    if program("flip-link").arg("--version").output().is_ok_and(|o| o.status.success()) {
+        // A stack that overflows then faults instead of writing over statics.
+        command.args(["--config", &format!("target.{TARGET}.linker=\"flip-link\"")]);
+    }
+    step(&format!("firmware {}", build.name()), &mut command)?;
+    let made = target_folder().join(TARGET).join("release/firmware");
+    let kept = target_folder().join(ELF_FOLDER).join(format!("{}.elf", build.name()));
+    std::fs::create_dir_all(target_folder().join(ELF_FOLDER)).context("the folder for ELF files")?;
+    std::fs::copy(&made, &kept).with_context(|| made.display().to_string())?;
+    Ok(kept)
+}
+
+fn target_folder() -> PathBuf {
+    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from)
+}
+
+/// Flashes the firmware and shows its log.
+pub fn flash() -> anyhow::Result<()> {
+    let elf = build(Build::Flashed)?;
+    probe_rs("run", &elf)
+}
+
+/// Shows the log of the firmware that runs.
+pub fn attach() -> anyhow::Result<()> {
+    let elf = build(Build::Flashed)?;
+    probe_rs("attach", &elf)
+}
+
+fn probe_rs(what: &str, elf: &Path) -> anyhow::Result<()> {
+    if !program("probe-rs").arg("--version").output().is_ok_and(|o| o.status.success()) {
+        bail!("probe-rs is not installed; `cargo install --locked probe-rs-tools` gets it");
+    }
+    step(&format!("probe-rs {what}"), program("probe-rs").args([what, "--chip", CHIP]).arg(elf))
+}
+
+/// Runs the firmware on the emulated board.
+pub fn emulate(arguments: &[String]) -> anyhow::Result<()> {
+    let elf = build(Build::Flashed)?;
+    build_emulator()?;
+    let mut command = program(target_folder().join("release/emulator"));
+    command.arg("--firmware").arg(elf).args(arguments);
+    let status = command.status().context("cannot run the emulator")?;
+    if !status.success() {
+        bail!("the emulated run failed");
+    }
+    Ok(())
+}
+
+/// The main job, without any hardware: the hall, mapped by the firmware on the emulated board.
+pub fn demo() -> anyhow::Result<()> {
+    emulate(&["--world", "hall", "--out", "out/demo"].map(String::from))?;
+    println!("\nThe map is drawn in out/demo/map.svg.");
+    Ok(())
+}
+
+fn build_emulator() -> anyhow::Result<()> {
+    // The emulated part asks for a newer compiler than it needs.
+    step("emulator", &mut cargo("build --release -p emulator --ignore-rust-version"))
+}
+
+/// Builds what the tests of the emulated board need, and says where it is.
+pub fn for_tests() -> anyhow::Result<[(&'static str, PathBuf); 3]> {
+    Ok([
+        ("LINESLAM_FIRMWARE_HANG", build(Build::Hanging)?),
+        ("LINESLAM_FIRMWARE_SLEEPS", build(Build::Sleeping)?),
+        // Last, so that it is the one that lies where cargo puts it.
+        ("LINESLAM_FIRMWARE", build(Build::Flashed)?),
+    ])
+}
