@@ -60,6 +60,12 @@ pub(crate) struct Measurement {
     variances: [f32; 2],
 }
 
+/// Where the covariance of two states lies: the lower triangle, row by row.
+fn packed(i: usize, j: usize) -> usize {
+    let (row, column) = if i >= j { (i, j) } else { (j, i) };
+    row * (row + 1) / 2 + column
+}
+
 impl Joint {
     /// A pose known for certain, and odometry errors with these standard deviations.
     pub fn new(sigma_odometry: Vector3<f32>) -> Self {
@@ -115,13 +121,27 @@ impl Joint {
     }
 
     fn get(&self, i: usize, j: usize) -> f32 {
-        let (row, column) = if i >= j { (i, j) } else { (j, i) };
-        self.covariance.get(row * (row + 1) / 2 + column).copied().unwrap_or(0.0)
+        self.covariance.get(packed(i, j)).copied().unwrap_or(0.0)
+    }
+
+    /// Adds so many times the covariances of a state with the first states.
+    fn add_row(&self, state: usize, by: f32, sums: &mut [f32]) {
+        // Up to the diagonal they lie side by side …
+        let (beside, below) = sums.split_at_mut_checked(state + 1).unwrap_or_default();
+        let begin = packed(state, 0);
+        if let Some(row) = self.covariance.get(begin..=begin + state) {
+            beside.iter_mut().zip(row).for_each(|(sum, value)| *sum += by * value);
+        }
+        // … beyond it one in each row, and each row is longer by one.
+        let mut at = packed(state + 1, state);
+        for (row, sum) in (state + 1..).zip(below) {
+            *sum += by * self.covariance.get(at).copied().unwrap_or(0.0);
+            at += row + 1;
+        }
     }
 
     fn set(&mut self, i: usize, j: usize, value: f32) {
-        let (row, column) = if i >= j { (i, j) } else { (j, i) };
-        if let Some(slot) = self.covariance.get_mut(row * (row + 1) / 2 + column) {
+        if let Some(slot) = self.covariance.get_mut(packed(i, j)) {
             *slot = value;
         }
     }
@@ -287,9 +307,9 @@ impl Joint {
 
     fn measure_row(&mut self, error: f32, row: &Row, variance: f32, learning: Option<[usize; 2]>) {
         let states = self.states();
-        let mut with = [0.0; STATES];
-        for (state, value) in with.iter_mut().enumerate().take(states) {
-            *value = row.iter().map(|&(other, by)| by * self.get(state, other)).sum();
+        let mut with = [-0.0; STATES];
+        for &(other, by) in row {
+            self.add_row(other, by, with.get_mut(..states).unwrap_or_default());
         }
         let total: f32 =
             row.iter().map(|&(state, by)| by * with.get(state).copied().unwrap_or(0.0)).sum::<f32>()
@@ -308,11 +328,15 @@ impl Joint {
         for (state, value) in with.iter().enumerate().take(states) {
             let Some((packed, below)) = rest.split_at_mut_checked(state + 1) else { return };
             let gain = value / total;
-            let own = learns(state);
-            for (column, (covariance, other)) in packed.iter_mut().zip(&with).enumerate() {
-                if own || learns(column) {
-                    *covariance -= gain * other;
+            match learning {
+                Some(learning) if !learning.contains(&state) => {
+                    for column in learning {
+                        if let (Some(covariance), Some(other)) = (packed.get_mut(column), with.get(column)) {
+                            *covariance -= gain * other;
+                        }
+                    }
                 }
+                _ => packed.iter_mut().zip(&with).for_each(|(covariance, other)| *covariance -= gain * other),
             }
             if let Some(own) = packed.last_mut() {
                 *own = own.max(if *value == 0.0 { 0.0 } else { LEAST_VARIANCE });
@@ -374,10 +398,22 @@ impl Joint {
                     by * (2.0 * self.get(state, i) + among)
                 })
                 .sum::<f32>();
-        for column in (0..self.states()).filter(|column| *column != state) {
-            let value: f32 =
-                self.get(state, column) + others.iter().map(|&(i, by)| by * self.get(i, column)).sum::<f32>();
-            self.set(state, column, value);
+        let mut sums = [-0.0; STATES];
+        let sums = sums.get_mut(..self.states()).unwrap_or_default();
+        for &(i, by) in others {
+            self.add_row(i, by, sums);
+        }
+        let (beside, below) = sums.split_at_mut_checked(state + 1).unwrap_or_default();
+        let begin = packed(state, 0);
+        if let Some(row) = self.covariance.get_mut(begin..begin + state) {
+            row.iter_mut().zip(beside).for_each(|(value, sum)| *value += *sum);
+        }
+        let mut at = packed(state + 1, state);
+        for (row, sum) in (state + 1..).zip(below) {
+            if let Some(value) = self.covariance.get_mut(at) {
+                *value += *sum;
+            }
+            at += row + 1;
         }
         self.set(state, state, own.max(0.0));
     }
