@@ -7,13 +7,20 @@ use lineslam::robot::Robot;
 use slam_core::SlamConfig;
 use slam_core::pose::components;
 
+/// Boards, by their features as cargo spells them, and their memory.
+const BOARDS: [(&str, &str); 1] = [("NUCLEO_F429ZI", "memory.x")];
+
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os != "none") {
         return;
     }
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
-    let memory = "memory.x";
+    let chosen = BOARDS.iter().find(|(feature, _)| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some());
+    let Some((_, memory)) = chosen else {
+        println!("cargo::error=no board is chosen: name its feature");
+        std::process::exit(1);
+    };
     println!("cargo::rerun-if-changed={memory}");
     fs::copy(memory, out.join("memory.x")).expect("memory.x can be copied");
     println!("cargo::rustc-link-search={}", out.display());
