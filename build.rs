@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
-use lineslam::robot::Robot;
+use robot_file::robot::Robot;
 use slam_core::SlamConfig;
 use slam_core::pose::components;
 

@@ -108,9 +108,13 @@ pub async fn run(pins: LidarPins, mut scans: Sender<'static, CriticalSectionRawM
         }
         let (counters, decoded) = (client.counters(), client.decoder_counters());
         STATE.scans.store(counters.scans, Ordering::Relaxed);
-        STATE.missed.store(counters.missed, Ordering::Relaxed);
+        if STATE.missed.swap(counters.missed, Ordering::Relaxed) != counters.missed {
+            defmt::warn!("lidar: {=u32} scans missed so far", counters.missed);
+        }
         STATE.losses.store(counters.losses, Ordering::Relaxed);
-        STATE.port_errors.store(counters.port_errors, Ordering::Relaxed);
+        if STATE.port_errors.swap(counters.port_errors, Ordering::Relaxed) != counters.port_errors {
+            defmt::warn!("lidar: {=u32} errors of the port so far", counters.port_errors);
+        }
         if STATE.dropped.swap(decoded.scans_dropped, Ordering::Relaxed) != decoded.scans_dropped {
             defmt::warn!("lidar: a scan was dropped; {}", decoded);
         }

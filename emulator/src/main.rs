@@ -9,7 +9,7 @@ use clap::Parser;
 use comfy_table::{Table, presets};
 use emulator::fault::Fault;
 use emulator::report::{self, Judged};
-use emulator::run::{Outcome, Plan, Progress, run};
+use emulator::run::{Outcome, Plan, Seen, run};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use lineslam::output::svg::{self, Picture, Scene};
 use lineslam::output::{self, csv, tum};
@@ -33,7 +33,7 @@ struct Cli {
     /// Seed of all noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Ends the run after so many seconds of virtual time, if the path has not ended before.
+    /// Length of the run, seconds of virtual time. By default it ends when the path does.
     #[arg(long, value_name = "N")]
     seconds: Option<u64>,
     /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.dat, log.txt, console.tum and report.json.
@@ -49,6 +49,9 @@ struct Cli {
     #[arg(long)]
     log: bool,
 }
+
+/// Steps of the progress bar.
+const BAR: u64 = 1000;
 
 fn main() -> ExitCode {
     match emulate(&Cli::parse()) {
@@ -79,22 +82,22 @@ fn emulate(cli: &Cli) -> anyhow::Result<()> {
         faults: cli.faults.clone(),
     };
     let bar = progress_bar();
-    let shown = bar.clone();
-    let outcome = run(&plan, move |p: Progress| {
-        shown.set_position(p.now_us / 1_000_000);
-        shown.set_message(format!(
-            "{:.3} m off, {} segments, {:.2} ms a scan",
-            p.error_m,
-            p.segments,
-            f64::from(p.took_us) * 1e-3
-        ));
+    let (shown, with_log) = (bar.clone(), cli.log);
+    let outcome = run(&plan, move |seen| match seen {
+        Seen::Line(line) if with_log => shown.suspend(|| println!("{line}")),
+        Seen::Line(_) => {}
+        Seen::Progress(p) => {
+            shown.set_position((p.driven * BAR as f64) as u64);
+            shown.set_message(format!(
+                "{:.0} s of virtual time, {:.3} m off, {} segments, {:.1} ms a scan",
+                p.now_us as f64 * 1e-6,
+                p.error_m,
+                p.segments,
+                f64::from(p.took_us) * 1e-3
+            ));
+        }
     })?;
     bar.finish_and_clear();
-    if cli.log {
-        for line in &outcome.log {
-            println!("{line}");
-        }
-    }
     let judged = report::judge(&world, cli.seed, &outcome)?;
     let files = files(&world, &robot, &outcome, &judged)?;
     output::write_all(&cli.out, &files)?;
@@ -145,14 +148,14 @@ fn files(
 }
 
 fn progress_bar() -> ProgressBar {
-    let style = ProgressStyle::with_template("{spinner:.cyan} {pos} s of virtual time, {msg}  ({elapsed})")
+    let style = ProgressStyle::with_template("{bar:30.cyan/dim} {percent} %  {msg}  ({elapsed})")
         .expect("the template is a constant");
     let target = if std::io::stderr().is_terminal() {
         ProgressDrawTarget::stderr()
     } else {
         ProgressDrawTarget::hidden()
     };
-    ProgressBar::with_draw_target(None, target).with_style(style)
+    ProgressBar::with_draw_target(Some(BAR), target).with_style(style)
 }
 
 fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {

@@ -80,10 +80,12 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
     let mut took: Vec<u32> = Vec::new();
     let mut late_us: Vec<i64> = Vec::new();
     let mut samples: Vec<WheelTicks> = Vec::new();
+    let mut sent = outcome.scans.iter();
     for (number, entry) in outcome.entries.iter().enumerate() {
         samples.extend(&entry.samples);
         let Event::Scan { middle_us, ranges_mm, took_us } = &entry.event else { continue };
-        let Some(truth) = outcome.scans.iter().find(|s| s.ranges_mm == *ranges_mm) else {
+        // They come in the order in which they were sent.
+        let Some(truth) = sent.by_ref().find(|s| s.ranges_mm == *ranges_mm) else {
             anyhow::bail!("the firmware took in a scan at {middle_us} µs that the sensor never sent");
         };
         let ticks = samples.iter().rev().find(|s| s.stamp_us <= *middle_us).copied().unwrap_or_default();

@@ -48,6 +48,8 @@ pub struct Building {
     /// Pose at each step so far, one ahead of now.
     poses: Vec<Isometry2<f64>>,
     ticks: [i64; 2],
+    path_m: f64,
+    driven_m: f64,
     /// Scans that were sent.
     pub scans: Vec<TrueScan>,
 }
@@ -78,6 +80,8 @@ impl Building {
             base_from_laser: nalgebra::convert(config.sensor.mounting.base_from_laser),
             beam_us,
             first_beam_us: f64::from(geometry.first_step) * beam_us,
+            path_m: path_length(&world),
+            driven_m: 0.0,
             poses: vec![base.pose],
             ticks: base.ticks(),
             base,
@@ -91,6 +95,11 @@ impl Building {
         self.base.arrived()
     }
 
+    /// Share of the path that is driven, 0 to 1.
+    pub fn driven(&self) -> f64 {
+        if self.arrived() { 1.0 } else { (self.driven_m / self.path_m).min(1.0) }
+    }
+
     /// Where `base` is, in the world.
     pub fn pose_at_us(&self, us: f64) -> Isometry2<f64> {
         interpolate(&self.poses, us / STEP_US as f64)
@@ -100,7 +109,9 @@ impl Building {
     pub fn advance(&mut self, now_us: u64, edges: &mut Vec<Edge>) {
         while (self.poses.len() as u64 - 1) * STEP_US <= now_us {
             let begin_ns = (self.poses.len() as u64 - 1) * STEP_US * 1000;
+            let before = self.base.pose.translation.vector;
             self.base.step(STEP_US as f64 * 1e-6);
+            self.driven_m += (self.base.pose.translation.vector - before).norm();
             self.poses.push(self.base.pose);
             let ticks = self.base.ticks();
             for (side, (before, after)) in self.ticks.into_iter().zip(ticks).enumerate() {
@@ -134,6 +145,11 @@ impl Building {
         let world_from_base = self.pose_at_us(middle_us);
         self.scans.push(TrueScan { middle_us: middle_us as u64, world_from_base, ranges_mm: measured });
     }
+}
+
+fn path_length(world: &World) -> f64 {
+    let points = &world.path.points;
+    points.windows(2).map(|p| (p[1][0] - p[0][0]).hypot(p[1][1] - p[0][1])).sum()
 }
 
 /// Lines of a quadrature encoder: A leads B when it counts up.

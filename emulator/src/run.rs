@@ -44,10 +44,19 @@ pub struct Plan<'a> {
     pub sim: SimConfig,
     /// Of all noise.
     pub seed: u64,
-    /// Ends the run then, if the path has not ended before, virtual seconds.
+    /// Length of the run, virtual seconds; without, it ends a while after the path.
     pub seconds: Option<u64>,
     /// What goes wrong.
     pub faults: Vec<Fault>,
+}
+
+/// What there is to see while it runs.
+#[derive(Clone, Debug)]
+pub enum Seen {
+    /// A line of the firmware's log.
+    Line(LogLine),
+    /// The firmware has taken in a scan.
+    Progress(Progress),
 }
 
 /// How far a run has come.
@@ -55,6 +64,8 @@ pub struct Plan<'a> {
 pub struct Progress {
     /// Virtual time, microseconds.
     pub now_us: u64,
+    /// Share of the path that is driven.
+    pub driven: f64,
     /// Distance of the firmware's pose from the truth, metres.
     pub error_m: f64,
     /// Segments of the map.
@@ -85,8 +96,8 @@ pub struct Outcome {
     pub arrived: bool,
 }
 
-/// Runs the plan. `progress` is told now and then.
-pub fn run(plan: &Plan<'_>, progress: impl FnMut(Progress) + Send + 'static) -> anyhow::Result<Outcome> {
+/// Runs the plan. `see` is shown the log as it comes, and how far the run is.
+pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::Result<Outcome> {
     let elf = std::fs::read(plan.elf).with_context(|| plan.elf.display().to_string())?;
     let symbols = Symbols::read(&elf, plan.elf)?;
     let building = Building::new(plan.world, plan.robot, &plan.sim, plan.seed)?;
@@ -108,14 +119,14 @@ pub fn run(plan: &Plan<'_>, progress: impl FnMut(Progress) + Send + 'static) -> 
         edges: VecDeque::new(),
         grid_us: 0,
         faults: plan.faults.clone(),
-        limit_us: plan.seconds.map_or(u64::MAX, |s| s * 1_000_000),
+        limit_us: plan.seconds.map(|s| s * 1_000_000),
         rested_us: None,
         pressed_us: None,
         map_printed: false,
         resets: 0,
         led: false,
         led_changes: 0,
-        progress: Box::new(progress),
+        see: Box::new(see),
         failure: None,
     };
     let images = [Image::new(plan.elf, elf, None)?];
@@ -155,14 +166,14 @@ struct Director {
     edges: VecDeque<Edge>,
     grid_us: u64,
     faults: Vec<Fault>,
-    limit_us: u64,
+    limit_us: Option<u64>,
     rested_us: Option<u64>,
     pressed_us: Option<u64>,
     map_printed: bool,
     resets: usize,
     led: bool,
     led_changes: u32,
-    progress: Box<dyn FnMut(Progress) + Send>,
+    see: Box<dyn FnMut(Seen) + Send>,
     failure: Option<anyhow::Error>,
 }
 
@@ -237,7 +248,11 @@ impl Director {
         host: &mut dyn Host,
     ) -> anyhow::Result<bool> {
         let now_us = stop.at.0 / 1000;
+        let before = self.lines.len();
         self.log.drain(host, &mut self.lines)?;
+        for line in self.lines.iter().skip(before) {
+            (self.see)(Seen::Line(line.clone()));
+        }
         if session.resets().len() != self.resets {
             self.resets = session.resets().len();
             self.recorder.restarted();
@@ -270,7 +285,7 @@ impl Director {
         if self.rested_us.is_none() && arrived {
             self.rested_us = Some(now_us + REST_US);
         }
-        let due = self.limit_us.min(self.rested_us.unwrap_or(u64::MAX));
+        let due = self.limit_us.or(self.rested_us).unwrap_or(u64::MAX);
         match self.pressed_us {
             None if now_us >= due => {
                 self.pressed_us = Some(now_us);
@@ -295,6 +310,7 @@ impl Director {
         let Some(entry) = self.recorder.entries.last() else { return Ok(()) };
         let crate::record::Event::Scan { ranges_mm, took_us, .. } = &entry.event else { return Ok(()) };
         let (pose, segments, took_us) = (entry.map_from_base(), entry.segments, *took_us);
+        let driven = self.room(|room| room.building.driven())?;
         let error_m = self.room(|room| {
             let scans = &room.building.scans;
             let truth = scans.iter().rev().take(5).find(|s| s.ranges_mm == *ranges_mm);
@@ -303,7 +319,8 @@ impl Director {
                 (estimate.translation.vector - truth.world_from_base.translation.vector).norm()
             })
         })?;
-        (self.progress)(Progress { now_us, error_m: error_m.unwrap_or(f64::NAN), segments, took_us });
+        let error_m = error_m.unwrap_or(f64::NAN);
+        (self.see)(Seen::Progress(Progress { now_us, driven, error_m, segments, took_us }));
         Ok(())
     }
 }

@@ -147,4 +147,20 @@ fn a_thousand_sleeps_of_odd_lengths_end_in_time() {
     let latest_us: u64 = words[7].parse().unwrap();
     // A tick of a microsecond, and the instructions from the alarm to the task.
     assert!(latest_us <= 10, "{}", said.text);
+    // Then it panics: it says where, is reset, and says so again.
+    assert!(says(&outcome, "ERROR", "panic at src/start.rs:"));
+    assert!(says(&outcome, "INFO", "reset by Software"));
+    assert!(says(&outcome, "ERROR", "the last run panicked, at line"));
+}
+
+#[test]
+fn an_hour_passes_without_a_trace() {
+    let (outcome, judged) = hall(Some(3600), &["stamp-wrap"]);
+    let report = &judged.report;
+    assert!(outcome.arrived && report.virtual_s >= 3600.0);
+    assert!(report.scans_used > 35_950, "{}", report.scans_used);
+    assert!(report.scans_sent - report.scans_used <= 1);
+    assert_eq!(outcome.resets, []);
+    assert!(last_error_m(&judged) < 0.10, "{}", last_error_m(&judged));
+    assert!(says(&outcome, "INFO", "lidar: missed 0, dropped 0"));
 }

@@ -7,8 +7,8 @@ pub mod experiments;
 pub mod log;
 pub mod output;
 pub mod replay;
-pub mod robot;
 pub mod score;
 pub mod serial;
 pub mod sim;
-pub mod toml_file;
+
+pub use robot_file::{robot, toml_file};

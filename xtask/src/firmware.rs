@@ -19,7 +19,7 @@ pub enum Build {
     Flashed,
     /// Stops processing after a while, for the test of the watchdog.
     Hanging,
-    /// Sleeps a thousand times and says how late it woke, for the test of the emulated time driver.
+    /// Sleeps a thousand times, says how late it woke and panics, for the tests of the emulated time driver and of last words.
     Sleeping,
 }
 
