@@ -24,7 +24,6 @@ unsafe fn UART5() {
 #[embassy_executor::main]
 async fn main(spawner: Spawner) {
     let (mut board, cause) = board::start();
-    board.watchdog.unleash();
     defmt::info!(
         "lineslam {=str} on {=str}, robot {=str}; room for {=usize} segments, {=usize} bytes of map",
         env!("CARGO_PKG_VERSION"),
@@ -35,6 +34,9 @@ async fn main(spawner: Spawner) {
     );
     defmt::info!("reset by {}", cause);
     faults::report();
+    #[cfg(feature = "sleeps")]
+    sleeps().await;
+    board.watchdog.unleash();
     let (keeper, found) = match Keeper::take() {
         Ok(kept) => kept,
         Err(error) => {
@@ -54,10 +56,6 @@ async fn main(spawner: Spawner) {
     let (sender, receiver) = SCANS.init(Channel::new(buffers)).split();
 
     let urgent = URGENT.start(board::URGENT);
-    #[cfg(feature = "sleeps")]
-    if let Ok(sleeps) = sleeps() {
-        urgent.spawn(sleeps);
-    }
     // Each task is spawned once, so there is room for it.
     match (encoders::run(board.encoders, ticks), lidar::run(board.lidar, sender)) {
         (Ok(encoders), Ok(lidar)) => {
@@ -79,12 +77,15 @@ async fn main(spawner: Spawner) {
     if let Some(Ok(console)) = board.console.open().map(console::run) {
         spawner.spawn(console);
     }
+    #[cfg(feature = "sleeps")]
+    if let Ok(last_words) = last_words() {
+        spawner.spawn(last_words);
+    }
     defmt::debug!("{=usize} bytes of map and odometry", Mapper::BYTES);
 }
 
-/// Sleeps a thousand times, 1 to 9 990 µs, says how late it woke at the latest, and panics.
+/// Sleeps a thousand times, 1 to 9 990 µs, and says how late it woke at the latest.
 #[cfg(feature = "sleeps")]
-#[embassy_executor::task]
 async fn sleeps() {
     use embassy_time::{Instant, Timer};
     let mut latest_us = 0;
@@ -94,5 +95,12 @@ async fn sleeps() {
         latest_us = latest_us.max((Instant::now() - end).as_micros());
     }
     defmt::info!("slept 1000 times; woke at the latest {=u64} us after the end", latest_us);
+}
+
+/// Panics after three seconds.
+#[cfg(feature = "sleeps")]
+#[embassy_executor::task]
+async fn last_words() {
+    embassy_time::Timer::after_secs(3).await;
     panic!("as this build is told to");
 }
