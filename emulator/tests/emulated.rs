@@ -138,7 +138,7 @@ fn stamps_of_the_sensor_wrap_without_notice() {
 /// counter period late.
 #[test]
 fn a_thousand_sleeps_of_odd_lengths_end_in_time() {
-    let (outcome, _) = run_in("sleeps", Some(14), &[]);
+    let (outcome, _) = run_in("sleeps", Some(226), &[]);
     let said =
         outcome.log.iter().find(|l| l.text.starts_with("slept ")).expect("the firmware says how it slept");
     // slept 1000 times; woke at the latest 3 us after the end
