@@ -276,7 +276,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         }
     }
 
-    /// Looks for the sensor at every bit rate and in every state, and sets it up; scans do not run yet. Ends within 6 s.
+    /// Looks for the sensor at every bit rate and in every state, and sets it up; scans do not run yet. Ends within 9 s.
     pub async fn connect(&mut self) -> Result<&SensorInfo, ClientError<P::Error>> {
         self.connected = false;
         self.stream = None;
@@ -292,7 +292,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
     ///
     /// Connects where there is no connection, after a pause if the last attempt failed. After any error the next call
     /// connects anew, so calling this for ever is all that is needed. It ends within
-    /// 6 s, the longest pause and the longest silence; cancelling it costs the scan that is being read.
+    /// 9 s, the longest pause and the longest silence; cancelling it costs the scan that is being read.
     pub async fn next_scan(&mut self, ranges_mm: &mut [u16]) -> Result<Scan, ClientError<P::Error>> {
         let was_connected = self.connected;
         if !was_connected {

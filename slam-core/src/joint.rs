@@ -15,6 +15,7 @@
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
 use crate::map::SegmentMap;
+use crate::math::within;
 use crate::odometry_bias::OdometryBias;
 use crate::pose::{components, cross, perpendicular, pose};
 use crate::segment::Segment;
@@ -432,7 +433,7 @@ impl Joint {
         if var_direction > 0.0 {
             let way = -self.get(offset, direction) / var_direction;
             let (a, b) = (segment.along_of(segment.start), segment.along_of(segment.end));
-            let way = if a <= b { way.clamp(a, b) } else { 0.0 };
+            let way = if a <= b { within(way, a, b) } else { 0.0 };
             self.add_states(offset, &[(direction, way)]);
             segment.moments.centroid += segment.direction * way;
         }
@@ -447,7 +448,7 @@ impl Joint {
         let own = self.get(state, state).max(LEAST_VARIANCE);
         let with = Vector3::from_fn(|i, _| self.get(POSE + i, state));
         let explained = pose_information.map_or(0.0, |w| with.dot(&(w * with)));
-        (own - explained).clamp(0.01 * own, own).max(LEAST_VARIANCE)
+        within(own - explained, 0.01 * own, own).max(LEAST_VARIANCE)
     }
 
     /// Tracks a segment just added to the map, seen from the pose with these variances of its own.

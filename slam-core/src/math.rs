@@ -23,6 +23,13 @@ pub fn sqrt(value: f32) -> f32 {
     if value < 0.0 { 0.0 } else { libm::sqrtf(value) }
 }
 
+/// A value kept within limits; NaN gives the upper one, and where they are in the wrong order the lower wins. `f32::clamp`
+/// panics then, and its message brings the printing of floats with it: 15 kB of flash.
+#[inline]
+pub fn within(value: f32, low: f32, high: f32) -> f32 {
+    value.min(high).max(low)
+}
+
 /// Wraps an angle in radians to (-π, π]. NaN and infinities give NaN.
 #[inline]
 pub fn wrap_angle(angle_rad: f32) -> f32 {

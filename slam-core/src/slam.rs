@@ -16,7 +16,7 @@ use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, SegmentMap};
-use crate::math::{sqrt, wrap_angle};
+use crate::math::{sqrt, within, wrap_angle};
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
@@ -411,7 +411,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let broad = Prior { covariance: broadened(prior, &self.map_from_base, 0.5 * reach_rad), ..*prior };
         let centre = components(&prior.pose);
         let mut winner: Option<SlamUpdate> = None;
-        let turns = (reach_rad / config.step_rad).clamp(0.0, 255.0) as u8;
+        let turns = within(reach_rad / config.step_rad, 0.0, 255.0) as u8;
         for turn in 1..=turns {
             for side in [-1.0, 1.0] {
                 let mut hypothesis = *predicted;
