@@ -48,13 +48,12 @@ pub const URG_BRR: u64 = 0x4001_1408;
 pub struct Nucleo {
     /// The microcontroller: an STM32F427, which has all that the firmware uses of the STM32F429.
     pub mcu: Stm32f427,
-    shared: Shared,
 }
 
 impl Nucleo {
     /// Powered and wired, not yet running.
     pub fn new(shared: Shared) -> Result<Self, Error> {
-        let mut board = Self { mcu: Stm32f427::new()?, shared: shared.clone() };
+        let mut board = Self { mcu: Stm32f427::new()? };
         board.mcu.rcc.attach_crystals(8_000_000, Crystal::NONE.0);
         board.mcu.set_supply(Supply(3300).0);
         board.mcu.usart[URG_PORT].attach(Urg { shared: shared.clone() });
@@ -187,12 +186,5 @@ impl Peer for Console {
 
     fn transmit(&mut self, _: VirtualNanos) -> Option<u16> {
         None
-    }
-}
-
-impl Nucleo {
-    /// What the simulation and the board share.
-    pub fn shared(&self) -> &Shared {
-        &self.shared
     }
 }

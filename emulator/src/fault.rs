@@ -10,7 +10,7 @@ use crate::room::Room;
 
 /// One fault. From the command line: `unplug@20+5` (seconds: when, how long; plugged in again it powers up),
 /// `garble=10000` (one byte in so many), `line=20` (noise and framing errors, so many in a million bytes each),
-/// `streaming=750000` (found so, at that bit rate), `reset@30` (by pin), `press@30` (the button).
+/// `streaming=750000` (found so, at that bit rate), `reset@30` (by pin), `stamp-wrap` (its stamps wrap after 20 s).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// The sensor's plug is pulled, and put in again after a while.
@@ -77,11 +77,7 @@ impl Fault {
     pub fn prepare(&self, room: &mut Room, seed: u64) {
         match *self {
             Self::Garble { one_in } => room.urg.faults.garbled_one_in = one_in,
-            Self::Streaming { baud_rate } => {
-                let faults = room.urg.faults;
-                room.already_streaming(baud_rate, seed);
-                room.set_faults(faults);
-            }
+            Self::Streaming { baud_rate } => room.already_streaming(baud_rate, seed),
             // 20 s before the 24 bits are full.
             Self::StampWrap => room.urg.set_timer_ms(0, 0xFF_FFFF - 20_000),
             Self::Unplug { .. } | Self::Line { .. } | Self::Reset { .. } => {}

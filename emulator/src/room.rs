@@ -7,7 +7,7 @@ use lineslam::sim::world::World;
 use lineslam::sim::{SimConfig, interpolate, streams};
 use nalgebra::Isometry2;
 use rigless::device::Level;
-use scip::sim::{Faults, Mode, SimulatedUrg, rates_agree};
+use scip::sim::{Mode, SimulatedUrg, rates_agree};
 use slam_core::SlamConfig;
 
 /// The base is stepped this often, microseconds.
@@ -182,11 +182,8 @@ impl Room {
 
     /// The sensor has been on for long and streams, at another bit rate than the firmware wants.
     pub fn already_streaming(&mut self, baud_rate: u32, seed: u64) {
+        let faults = self.urg.faults;
         self.urg = SimulatedUrg::found(0, seed, baud_rate, Mode::Streaming);
-    }
-
-    /// What goes wrong in the sensor from now on.
-    pub fn set_faults(&mut self, faults: Faults) {
         self.urg.faults = faults;
     }
 

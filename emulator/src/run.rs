@@ -271,7 +271,7 @@ impl Director {
             while room.urg.next_us() + STALE_US < now_us && room.from_sensor(now_us).is_some() {}
         })?;
         self.edges.extend(edges);
-        for fault in self.faults.clone() {
+        for fault in &self.faults {
             fault.at(now_us, GRID_US, session, &self.shared, stop, host)?;
         }
         let led = session.board_mut().led();
