@@ -1,10 +1,10 @@
 //! Memory of the board, linker arguments, and the robot file as constants.
 
+use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use robot_file::robot::Robot;
-use slam_core::SlamConfig;
 use slam_core::pose::components;
 
 /// Boards, by their features as cargo spells them, and their memory.
@@ -39,16 +39,17 @@ fn constants(path: &Path) -> String {
     let robot = match Robot::load(path) {
         Ok(robot) => robot,
         Err(error) => {
-            println!("cargo::error=LINESLAM_ROBOT={}: {error}", path.display());
+            // The file, then why; a message of several lines has to be one here.
+            let why = error.source().map_or_else(String::new, |why| format!(": {why}").replace('\n', " "));
+            println!("cargo::error=LINESLAM_ROBOT: {error}{why}");
             std::process::exit(1);
         }
     };
-    let (Some(drive), Some(beams)) = (robot.drive(), robot.beams()) else {
+    let (Some(drive), Some(_)) = (robot.drive(), robot.beams()) else {
         println!("cargo::error=LINESLAM_ROBOT={}: [wheels] and [sensor.steps] are needed", path.display());
         std::process::exit(1);
     };
-    let mut config = SlamConfig::default();
-    robot.apply(&mut config, beams, None);
+    let config = robot.config();
     let (noise, sensor) = (config.odometry.noise, config.sensor);
     let mounting = components(&sensor.mounting.base_from_laser);
     format!(

@@ -1,6 +1,6 @@
 //! What a reset does not take: the map with the pose, and the wheels' ticks, in RAM that the start-up code leaves alone.
 //!
-//! The map is valid where its seal says so: a magic word, the checksum of this firmware's own code (another firmware
+//! The map is valid where its seal says so: a magic word, the checksum of this firmware's own code and constants (another firmware
 //! lays memory out differently), and the checksum of the map itself. While it is worked on it is open, with the seal of
 //! its last state; a reset in that time leaves it half done, and it is put in order. Power-up leaves noise, which no
 //! checksum fits.
@@ -131,14 +131,14 @@ unsafe fn checksum(mapper: *const MaybeUninit<Mapper>) -> u32 {
     CRC.checksum(unsafe { core::slice::from_raw_parts(bytes, Mapper::BYTES) })
 }
 
-/// Checksum of this firmware's code.
+/// Checksum of this firmware's code and constants, which lie side by side.
 fn firmware_checksum() -> u32 {
     unsafe extern "C" {
         static __stext: u8;
-        static __etext: u8;
+        static __erodata: u8;
     }
-    let (from, to) = (addr_of!(__stext), addr_of!(__etext));
-    // SAFETY: the linker puts the code between these two, and nobody writes it.
+    let (from, to) = (addr_of!(__stext), addr_of!(__erodata));
+    // SAFETY: the linker puts code and constants between these two, and nobody writes them.
     let code = unsafe { core::slice::from_raw_parts(from, to.addr() - from.addr()) };
     CRC.checksum(code)
 }

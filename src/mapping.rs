@@ -14,7 +14,7 @@ use slam_core::pose::components;
 
 use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;
-use crate::kept::{Found, Keeper};
+use crate::kept::{Found, Keeper, Mapper};
 use crate::lidar::{STATE, ScanBuffer};
 use crate::trace::{Event, Tracer, sigma};
 
@@ -125,10 +125,7 @@ impl Mapping {
         let Self { keeper, tracer, .. } = self;
         let ranges_mm = scan.ranges_mm.get(..scan.len).unwrap_or(&[]);
         let update = keeper.update(|mapper| {
-            while let Ok(ticks) = encoders::SAMPLES.try_receive() {
-                tracer.sample(ticks);
-                mapper.push(ticks);
-            }
+            take_samples(mapper, tracer);
             mapper.scan(scan.middle_us, ranges_mm)
         });
         let took_us = begin.elapsed().as_micros() as u32;
@@ -169,10 +166,7 @@ impl Mapping {
         }
         let Self { keeper, tracer, .. } = self;
         let moved = keeper.update(|mapper| {
-            while let Ok(ticks) = encoders::SAMPLES.try_receive() {
-                tracer.sample(ticks);
-                mapper.push(ticks);
-            }
+            take_samples(mapper, tracer);
             mapper.coast(until_us)
         });
         self.tracer.event(Event::Coasted, until_us, &[], self.keeper.mapper(), 0);
@@ -251,5 +245,13 @@ impl Mapping {
             defmt::info!("end of map");
             None
         };
+    }
+}
+
+/// Takes in the samples of the wheels that have come.
+fn take_samples(mapper: &mut Mapper, tracer: &mut Tracer) {
+    while let Ok(ticks) = encoders::SAMPLES.try_receive() {
+        tracer.sample(ticks);
+        mapper.push(ticks);
     }
 }

@@ -1,8 +1,7 @@
 //! Starts the board and spawns the tasks.
 
 use defmt_rtt as _;
-use embassy_executor::{InterruptExecutor, Spawner};
-use embassy_stm32::interrupt;
+use embassy_executor::Spawner;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Channel;
 use slam_core::Slam;
@@ -12,14 +11,6 @@ use crate::kept::{Found, Keeper, KeptTicks, Mapper, SEGMENTS};
 use crate::lidar::ScanBuffer;
 use crate::trace::Tracer;
 use crate::{board, console, encoders, faults, lidar, mapping, robot, signs};
-
-static URGENT: InterruptExecutor = InterruptExecutor::new();
-
-#[interrupt]
-unsafe fn UART5() {
-    // SAFETY: this is the executor's interrupt, and only it calls this.
-    unsafe { URGENT.on_interrupt() }
-}
 
 #[embassy_executor::main]
 async fn main(spawner: Spawner) {
@@ -55,7 +46,7 @@ async fn main(spawner: Spawner) {
     let buffers = BUFFERS.init([ScanBuffer::EMPTY, ScanBuffer::EMPTY]);
     let (sender, receiver) = SCANS.init(Channel::new(buffers)).split();
 
-    let urgent = URGENT.start(board::URGENT);
+    let urgent = board::urgent();
     // Each task is spawned once, so there is room for it.
     match (encoders::run(board.encoders, ticks), lidar::run(board.lidar, sender)) {
         (Ok(encoders), Ok(lidar)) => {

@@ -9,7 +9,7 @@ use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
 use slam_core::odometry::Integration;
 use slam_core::scan::Reading;
-use slam_core::{MapSegment, Mapper, Segment, SlamConfig, WheelTicks};
+use slam_core::{MapSegment, Mapper, Segment, WheelTicks};
 
 use crate::record::{Entry, Event};
 use crate::run::Outcome;
@@ -163,7 +163,7 @@ pub fn log_text(judged: &Judged) -> String {
 
 /// Points of all scans in `map`, for the drawing.
 pub fn points(judged: &Judged, robot: &Robot) -> Vec<Point2<f32>> {
-    let config = config(robot);
+    let config = robot.config();
     let (geometry, mounting) = (config.sensor.geometry, config.sensor.mounting.base_from_laser);
     let mut points = Vec::new();
     for (scan, pose) in judged.drive.log.scans.iter().zip(&judged.poses).step_by(3) {
@@ -195,13 +195,6 @@ pub fn dead_reckoning(outcome: &Outcome, robot: &Robot) -> Vec<Isometry2<f32>> {
     path
 }
 
-/// The configuration that the firmware was built with.
-pub fn config(robot: &Robot) -> SlamConfig {
-    let mut config = SlamConfig::default();
-    robot.apply(&mut config, robot.beams().unwrap_or(scip::sim::BEAMS), None);
-    config
-}
-
 /// Where a PC and the firmware part.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Difference {
@@ -218,7 +211,7 @@ pub struct Difference {
 pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Option<Difference>> {
     let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
     // The sizes of `src/kept.rs`.
-    let mut mapper = Box::new(Mapper::<512, 64>::new(config(robot), drive)?);
+    let mut mapper = Box::new(Mapper::<512, 64>::new(robot.config(), drive)?);
     let known = entries.iter().take_while(|e| e.event != Event::Recovered);
     for (number, entry) in known.enumerate() {
         if entry.event == Event::Resumed {

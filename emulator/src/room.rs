@@ -8,7 +8,6 @@ use lineslam::sim::{SimConfig, interpolate, streams};
 use nalgebra::Isometry2;
 use rigless::device::Level;
 use scip::sim::{Mode, SimulatedUrg, rates_agree};
-use slam_core::SlamConfig;
 
 /// The base is stepped this often, microseconds.
 pub const STEP_US: u64 = 1000;
@@ -69,8 +68,7 @@ impl Building {
         let mut wheels =
             robot.wheels.ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
         wheels.counter_bits = 32;
-        let mut config = SlamConfig::default();
-        robot.apply(&mut config, robot.beams().unwrap_or(scip::sim::BEAMS), None);
+        let config = robot.config();
         let geometry = config.sensor.geometry;
         let beam_us = f64::from(geometry.revolution_us) / f64::from(geometry.steps_per_revolution);
         let [base_rng, scanner_rng] = streams(seed);

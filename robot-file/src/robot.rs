@@ -239,6 +239,13 @@ impl Robot {
         self.sensor.steps.map(|s| s.geometry().beams())
     }
 
+    /// The default configuration on this robot; a URG's beams where the file does not state them.
+    pub fn config(&self) -> SlamConfig {
+        let mut config = SlamConfig::default();
+        self.apply(&mut config, self.beams().unwrap_or(ScanGeometry::URG_04LX.beams()), None);
+        config
+    }
+
     /// Puts this robot into a configuration. `beams` and `stated` are the log's.
     pub fn apply(&self, config: &mut SlamConfig, beams: usize, stated: Option<&StatedGeometry>) {
         let n = &self.odometry_noise;

@@ -370,7 +370,9 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         let until_us = self.clock.now_us() + silence_us;
         loop {
             match self.hear(ranges_mm, None, until_us).await {
-                Some(Heard::Scan(head)) if is_of(&head, &stream) => return Ok(self.hand_out(&head, &stream)),
+                Some(Heard::Scan(head)) if is_of(&head, &stream) => {
+                    return self.hand_out(&head, &stream).ok_or(ClientError::NotFound);
+                }
                 Some(Heard::Scan(_)) => {
                     self.counters.foreign_scans = self.counters.foreign_scans.wrapping_add(1);
                 }
@@ -406,21 +408,21 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         Ok(stream)
     }
 
-    fn hand_out(&mut self, head: &ScanHead, stream: &Stream) -> Scan {
+    /// `None` only where no sensor has said how it turns, which no stream begins without.
+    fn hand_out(&mut self, head: &ScanHead, stream: &Stream) -> Option<Scan> {
         let arrived_us = self.clock.now_us();
-        let revolution =
-            self.info.as_ref().map_or((100_000, 1024), |i| (i.revolution_us(), i.steps_per_revolution));
-        let (revolution_us, steps) = (u64::from(revolution.0), u64::from(revolution.1.max(1)));
-        let sweep_us = u64::from(head.steps.last) * revolution_us / steps;
-        let least_delay_us = sweep_us + wire_bytes(&head.steps) * 10_000_000 / u64::from(self.rate.max(1));
+        let info = self.info.as_ref()?;
+        let revolution = (info.revolution_us(), info.steps_per_revolution);
+        let least_delay_us = info.step_us(head.steps.last)
+            + wire_bytes(&head.steps) * 10_000_000 / u64::from(self.rate.max(1));
         let stamp_us = self.sensor_clock.scan(head.stamp_ms, arrived_us, least_delay_us);
         if let Some(last_us) = self.last_stamp_us.replace(stamp_us) {
-            let period_us = (revolution_us * (u64::from(stream.interval) + 1)).max(1);
+            let period_us = (u64::from(revolution.0) * (u64::from(stream.interval) + 1)).max(1);
             let periods = (stamp_us.saturating_sub(last_us) + period_us / 2) / period_us;
             self.counters.missed = self.counters.missed.wrapping_add(periods.saturating_sub(1) as u32);
         }
         self.counters.scans = self.counters.scans.wrapping_add(1);
-        Scan { steps: head.steps, ranges: head.values, stamp_us, arrived_us, revolution }
+        Some(Scan { steps: head.steps, ranges: head.values, stamp_us, arrived_us, revolution })
     }
 
     /// Finds the bit rate and brings the sensor to an idle SCIP 2.0.

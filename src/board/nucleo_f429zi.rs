@@ -8,8 +8,10 @@
 //! | trajectory, USART3 | PD8 transmits | the ST-LINK's virtual COM port |
 //! | user LED, user button | PB0, PC13 | on the board |
 
+use embassy_executor::{InterruptExecutor, SendSpawner};
 use embassy_stm32::gpio::{Input, Level, Output, Pull, Speed};
-use embassy_stm32::interrupt::{self, InterruptExt, Priority};
+use embassy_stm32::interrupt;
+use embassy_stm32::interrupt::{InterruptExt, Priority};
 use embassy_stm32::mode::Async;
 use embassy_stm32::timer::qei::Qei;
 use embassy_stm32::usart::{self, RingBufferedUartRx, Uart, UartTx};
@@ -20,8 +22,19 @@ use static_cell::StaticCell;
 /// For the boot banner.
 pub const NAME: &str = "NUCLEO-F429ZI";
 
-/// The interrupt that runs what must not wait for the map. The board has no use for UART5 itself.
-pub use embassy_stm32::interrupt::UART5 as URGENT;
+/// Runs what must not wait for the map, on an interrupt: UART5's, for which the board has no other use.
+static URGENT: InterruptExecutor = InterruptExecutor::new();
+
+#[interrupt]
+unsafe fn UART5() {
+    // SAFETY: this is the executor's interrupt, and only it calls this.
+    unsafe { URGENT.on_interrupt() }
+}
+
+/// Starts the executor of what must not wait for the map. To be called once.
+pub fn urgent() -> SendSpawner {
+    URGENT.start(interrupt::UART5)
+}
 
 /// Bytes that DMA may hold for the lidar task: 10 ms at 500 kbit/s, ten times its longest wait.
 const RING: usize = 512;

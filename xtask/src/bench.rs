@@ -2,7 +2,7 @@
 
 use anyhow::{Context, bail};
 
-use crate::run::{announce, cargo, debian_package, program, root, step};
+use crate::run::{announce, cargo, debian_package, program, step, target_folder};
 
 /// Bytes of a full scan by `MD`.
 const SCAN_BYTES: f64 = 2137.0;
@@ -25,7 +25,7 @@ pub fn report() -> anyhow::Result<()> {
 }
 
 fn instructions(times: u32) -> anyhow::Result<u64> {
-    let example = root().join("target/release/examples/decode");
+    let example = target_folder().join("release/examples/decode");
     let output = program("valgrind")
         .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
         .arg(&example)

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 
 use crate::TARGET;
-use crate::run::{cargo, ensure_target, program, root, step};
+use crate::run::{cargo, ensure_target, is_installed, program, step, target_folder};
 
 /// What probe-rs calls the default board's chip.
 const CHIP: &str = "STM32F429ZITx";
@@ -46,7 +46,7 @@ pub fn build(build: Build) -> anyhow::Result<PathBuf> {
     ensure_target()?;
     let mut command =
         cargo(&format!("build --quiet --release -p firmware --target {TARGET} {}", build.features()));
-    if program("flip-link").arg("--version").output().is_ok_and(|o| o.status.success()) {
+    if is_installed("flip-link") {
         // A stack that overflows then faults instead of writing over statics.
         command.args(["--config", &format!("target.{TARGET}.linker=\"flip-link\"")]);
     }
@@ -56,10 +56,6 @@ pub fn build(build: Build) -> anyhow::Result<PathBuf> {
     std::fs::create_dir_all(target_folder().join(ELF_FOLDER)).context("the folder for ELF files")?;
     std::fs::copy(&made, &kept).with_context(|| made.display().to_string())?;
     Ok(kept)
-}
-
-fn target_folder() -> PathBuf {
-    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from)
 }
 
 /// Flashes the firmware and shows its log.
@@ -75,7 +71,7 @@ pub fn attach() -> anyhow::Result<()> {
 }
 
 fn probe_rs(what: &str, elf: &Path) -> anyhow::Result<()> {
-    if !program("probe-rs").arg("--version").output().is_ok_and(|o| o.status.success()) {
+    if !is_installed("probe-rs") {
         bail!("probe-rs is not installed; `cargo install --locked probe-rs-tools` gets it");
     }
     step(&format!("probe-rs {what}"), program("probe-rs").args([what, "--chip", CHIP]).arg(elf))

@@ -14,6 +14,16 @@ pub fn root() -> PathBuf {
     manifest.parent().map_or(manifest.clone(), PathBuf::from)
 }
 
+/// Where cargo puts what it makes.
+pub fn target_folder() -> PathBuf {
+    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from)
+}
+
+/// Whether a program is there and runs.
+pub fn is_installed(name: &str) -> bool {
+    program(name).arg("--version").output().is_ok_and(|o| o.status.success())
+}
+
 /// A program, to be run from the root.
 pub fn program(name: impl AsRef<OsStr>) -> Command {
     let mut command = Command::new(name);
@@ -58,8 +68,7 @@ pub fn ensure_target() -> anyhow::Result<()> {
 
 /// Installs a Debian package if its program is not there.
 pub fn debian_package(name: &str, command: &str) -> anyhow::Result<()> {
-    let there = program(command).arg("--version").output().is_ok_and(|o| o.status.success());
-    if there {
+    if is_installed(command) {
         return Ok(());
     }
     let is_root = program("id").arg("-u").output().is_ok_and(|o| o.stdout.trim_ascii() == b"0");

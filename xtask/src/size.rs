@@ -8,7 +8,7 @@ use object::{File, Object, ObjectSection, ObjectSymbol, SectionKind, SymbolKind}
 
 use crate::TARGET;
 use crate::firmware::{self, Build};
-use crate::run::{announce, cargo, root, step};
+use crate::run::{announce, cargo, step, target_folder};
 
 /// Flash that the firmware may take: code, constants, and what variables begin with.
 const FLASH_BUDGET: u64 = 200 * 1024;
@@ -48,7 +48,7 @@ pub fn report() -> anyhow::Result<()> {
 
     let command = format!("build --quiet --release -p footprint --target {TARGET}");
     step("size of the sensor's driver alone, bytes", &mut cargo(&command))?;
-    let driver = read(&root().join("target").join(TARGET).join("release/footprint"))?;
+    let driver = read(&target_folder().join(TARGET).join("release/footprint"))?;
     for (name, bytes) in largest(&driver.code_by_crate) {
         println!("{bytes:>9} of code in {name}");
     }

@@ -33,10 +33,11 @@ pub fn everything() -> anyhow::Result<()> {
         "doc --workspace --exclude emulator --exclude firmware --no-deps --features {features}"
     ));
     step("docs", docs.env("RUSTDOCFLAGS", "-D warnings"))?;
+    // The firmware that is flashed is built last of these, so that its size needs no build of its own.
+    let elves = firmware::for_tests()?;
     size::report()?;
     bench::report()?;
     let python = referee_python();
-    let elves = firmware::for_tests()?;
     tests(python, &elves)
 }
 

@@ -57,6 +57,12 @@ pub fn says(outcome: &Outcome, level: &str, text: &str) -> bool {
     outcome.log.iter().any(|line| line.level == level && line.text.contains(text))
 }
 
+/// Whether the last status line counts nothing lost.
+pub fn nothing_lost(outcome: &Outcome) -> bool {
+    let last = outcome.log.iter().rev().find(|line| line.text.starts_with("lidar: missed "));
+    last.is_some_and(|line| line.text.starts_with("lidar: missed 0, dropped 0, port errors 0, losses 0;"))
+}
+
 /// The error of the last pose, metres.
 pub fn last_error_m(judged: &Judged) -> f64 {
     judged.report.trajectory.final_position_error_m

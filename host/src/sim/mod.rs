@@ -14,7 +14,6 @@ use std::fmt::Write;
 use nalgebra::Isometry2;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
-use slam_core::SlamConfig;
 
 use crate::log::{Log, LoggedScan, Odometry};
 use crate::replay::ReplayError;
@@ -171,10 +170,9 @@ pub struct Drive {
 /// Drives the world's path once.
 pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result<Drive, ReplayError> {
     let wheels = robot.wheels.ok_or_else(|| ReplayError::NoWheels { robot: robot.name.clone() })?;
-    let mut config = SlamConfig::default();
-    robot.apply(&mut config, robot.beams().unwrap_or(682), None);
-    let geometry = config.sensor.geometry;
-    let base_from_laser: Isometry2<f64> = nalgebra::convert(config.sensor.mounting.base_from_laser);
+    let sensor = robot.config().sensor;
+    let geometry = sensor.geometry;
+    let base_from_laser: Isometry2<f64> = nalgebra::convert(sensor.mounting.base_from_laser);
     let [base_rng, scanner_rng] = streams(seed);
     let mut base = Base::new(&world.path, wheels, &sim.wheel, base_rng);
     let mut scanner = Scanner::new(world, sim.sensor, geometry, scanner_rng);
