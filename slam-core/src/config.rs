@@ -6,6 +6,7 @@ use crate::association::{AssociationConfig, BisectorConfig, GateConfig};
 use crate::correction::{CorrectionConfig, MapConfig, SearchConfig};
 use crate::deskew::DeskewConfig;
 use crate::extraction::{ExtractionConfig, RansacConfig, SplitConfig};
+use crate::keyframe::KeyframeConfig;
 use crate::loop_closure::LoopConfig;
 use crate::odometry::{Integration, OdometryNoise};
 use crate::odometry_bias::BiasConfig;
@@ -115,7 +116,7 @@ impl Default for SlamConfig {
             }),
             correction: CorrectionConfig::MaximumAPosteriori(MapConfig {
                 max_iterations: 8,
-                converged_step: 2e-4,
+                converged_step: 1e-3,
                 kernel_chi2: 4.0,
                 direction_trust_rad: 0.02,
                 observable_sigma_m: 0.1,
@@ -134,10 +135,9 @@ impl Default for SlamConfig {
             }),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
             registration: RegistrationConfig::Joint(JointConfig {
+                keyframes: KeyframeConfig { way_m: 0.15, scans: 10, at_start: 10 },
                 max_chi2: 60.0,
                 kernel_chi2: 1.5,
-                shared_factor: 3.5,
-                shared_way_m: 0.1,
                 young_hits: 4,
                 young_scans_per_hit: 2.1,
                 fuse_max_angle_rad: 0.1,
@@ -282,8 +282,8 @@ impl SlamConfig {
         if let RegistrationConfig::Joint(c) = &self.registration {
             positive("registration.joint.max_chi2", c.max_chi2)?;
             positive("registration.joint.kernel_chi2", c.kernel_chi2)?;
-            check("registration.joint.shared_factor", c.shared_factor >= 1.0)?;
-            positive("registration.joint.shared_way_m", c.shared_way_m)?;
+            positive("registration.joint.keyframes.way_m", c.keyframes.way_m)?;
+            check("registration.joint.keyframes.scans", c.keyframes.scans > 0)?;
             not_negative("registration.joint.young_scans_per_hit", c.young_scans_per_hit)?;
             positive("registration.joint.fuse_max_angle_rad", c.fuse_max_angle_rad)?;
             positive("registration.joint.fuse_max_distance_m", c.fuse_max_distance_m)?;

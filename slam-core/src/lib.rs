@@ -75,6 +75,7 @@ pub mod correction;
 pub mod deskew;
 pub mod extraction;
 pub mod joint;
+pub mod keyframe;
 pub mod loop_closure;
 pub mod map;
 pub mod mapper;

@@ -12,6 +12,7 @@ use nalgebra::{Isometry2, Point2};
 use crate::association::Pair;
 use crate::extraction::MAX_SEGMENTS;
 use crate::joint::{Joint, Measurement, variances, with_variances};
+use crate::keyframe::KeyframeConfig;
 use crate::map::{MapSegment, SegmentMap};
 use crate::math::wrap_angle;
 use crate::pose::{components, cross};
@@ -34,14 +35,12 @@ pub enum RegistrationConfig {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct JointConfig {
+    /// Which scans are taken in.
+    pub keyframes: KeyframeConfig,
     /// A pair that fits worse than this χ² changes nothing.
     pub max_chi2: f32,
     /// A pair that fits worse than this χ² counts for less: its variance grows with its χ².
     pub kernel_chi2: f32,
-    /// Scans from nearly the same place share errors (corners cut alike, edges mixed alike): variances count so many times …
-    pub shared_factor: f32,
-    /// … until the robot has moved about this far between two scans, metres; a radian counts as a metre.
-    pub shared_way_m: f32,
     /// A segment seen in fewer scans than this is young. A young one that is seen only now and then may be walking, or nothing:
     /// the pose learns nothing from it.
     pub young_hits: u16,
@@ -83,6 +82,8 @@ pub struct RegistrationReport {
     pub new: u32,
     /// Pairs that fitted too badly to be joined.
     pub doubtful: u32,
+    /// Whether the scan was taken into the map; the default takes in keyframes only.
+    pub keyframe: bool,
 }
 
 /// What the registration is given of a scan.
@@ -94,8 +95,6 @@ pub struct Observed<'a> {
     pub pairs: &'a [Pair],
     /// When they were seen.
     pub stamp: Stamp,
-    /// Way since the scan before, metres; a radian counts as a metre.
-    pub moved_m: f32,
     /// Errors of lines beyond their points' noise.
     pub line_noise: &'a LineNoise,
 }
@@ -116,7 +115,7 @@ pub fn register_end_points<const N: usize>(
     pose: &Isometry2<f32>,
     map: &mut SegmentMap<N>,
 ) -> RegistrationReport {
-    let mut report = RegistrationReport::default();
+    let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
     for pair in seen.pairs {
         let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
         else {
@@ -167,9 +166,7 @@ pub fn register_jointly<const N: usize>(
     joint: &mut Joint,
     map: &mut SegmentMap<N>,
 ) -> (Isometry2<f32>, RegistrationReport) {
-    let mut report = RegistrationReport::default();
-    let ways = seen.moved_m / config.shared_way_m;
-    let shared = 1.0 + (config.shared_factor - 1.0) / (1.0 + ways * ways * ways * ways);
+    let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
     let mut matched: Vec<Pair, MAX_SEGMENTS> = Vec::new();
     let position = start.prior.translation.vector;
     let mut since_prior = components(start.pose) - components(start.prior);
@@ -194,8 +191,7 @@ pub fn register_jointly<const N: usize>(
         let doubted = entry.hits < config.young_hits
             && joint.age_scans(place) > config.young_scans_per_hit * f32::from(entry.hits);
         let only = doubted.then_some(place);
-        let factor = shared * (chi2 / config.kernel_chi2).max(1.0);
-        joint.measure(&measurement, factor, only);
+        joint.measure(&measurement, (chi2 / config.kernel_chi2).max(1.0), only);
         mark_seen(entry, &seen.stamp);
         report.matched += 1;
         // As many pairs as observed segments at most.
@@ -370,7 +366,7 @@ mod tests {
     }
 
     fn observed<'a>(segments: &'a [Segment], pairs: &'a [Pair], scan: u32) -> Observed<'a> {
-        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, moved_m: 0.0, line_noise: &NOISE }
+        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, line_noise: &NOISE }
     }
 
     /// A robot that stands at the origin and is sure of it.

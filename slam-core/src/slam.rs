@@ -14,13 +14,14 @@ use crate::correction::{
 use crate::deskew::{DeskewReport, ScanPoint, deskew, fill_bearings};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
+use crate::keyframe::Keyframe;
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, SegmentMap};
 use crate::math::{sqrt, within, wrap_angle};
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
-use crate::pose::{components, is_finite, pose, rotate_covariance};
+use crate::pose::{components, is_finite, perpendicular, pose, rotate_covariance};
 use crate::registration::{
     Observed, RegistrationConfig, RegistrationReport, Stamp, Start, register_end_points, register_jointly,
     within_reach,
@@ -42,6 +43,7 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     way_m: f32,
     closing: PendingClosure,
     joint: Option<Joint>,
+    keyframe: Keyframe,
     bearings: Vec<Vector2<f32>, BEAMS>,
     points: Vec<ScanPoint, BEAMS>,
     observed: Vec<Segment, MAX_SEGMENTS>,
@@ -165,6 +167,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             way_m: 0.0,
             closing: PendingClosure::default(),
             joint: None,
+            keyframe: Keyframe::at(Isometry2::identity()),
             bearings: Vec::new(),
             points: Vec::new(),
             observed: Vec::new(),
@@ -199,7 +202,10 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// Covariance of the pose (x, y, θ), in `map`.
     pub fn covariance(&self) -> Matrix3<f32> {
-        self.joint.as_ref().map_or(self.local_covariance, Joint::pose_covariance)
+        let Some(joint) = &self.joint else { return self.local_covariance };
+        let carried = self.keyframe.carried(&joint.pose_covariance(), &self.map_from_base);
+        // The keyframe's own pose is the joint estimate's; another has an error of its own among the lines around it.
+        if self.keyframe.scans == 0 { carried } else { carried + self.local_covariance }
     }
 
     /// Systematic errors of the odometry as learnt so far.
@@ -252,8 +258,10 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             if let Some(config) = self.config.loop_closure {
                 self.close_loop(&config, &mut update);
             }
-            self.extend_map(&prior, motion, &mut update);
-            self.forget(scan, &update);
+            self.extend_map(&mut update);
+            if update.registration.keyframe {
+                self.forget(scan, &update);
+            }
         }
         self.count(&update);
         update.counters = self.counters;
@@ -270,6 +278,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.map_from_base = prior.pose;
         self.local_covariance = prior.covariance;
         self.counters.coasted = self.counters.coasted.saturating_add(1);
+        if self.keyframe_is_due() {
+            self.advance_joint();
+        }
         prior.pose
     }
 
@@ -299,6 +310,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if let Some(joint) = &mut self.joint {
             joint.clear(sigmas);
         }
+        self.keyframe = Keyframe::at(self.map_from_base);
         self.closing = PendingClosure::default();
         true
     }
@@ -309,17 +321,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// Eq. (1) with covariance: where the odometry says the base is.
     fn predict(&mut self, motion: &ScanMotion) -> Prior {
-        let increment = self.odometry_bias().corrected(&motion.since_previous);
-        let c = components(&(self.map_from_base * increment.before_from_after));
-        let moved = increment.before_from_after.translation.vector;
-        // Derivative of the new pose by the old heading.
-        let lever = crate::pose::perpendicular(self.map_from_base.rotation * moved);
-        let mut by_pose = Matrix3::identity();
-        (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
-        let grown = self.config.odometry.noise.covariance(&increment);
-        let noise = rotate_covariance(&self.map_from_base, &grown);
-        let covariance = by_pose * self.local_covariance * by_pose.transpose() + noise;
-        let prior = Prior { pose: pose(c.x, c.y, c.z), covariance };
+        let moved = self.moved(&self.map_from_base, &motion.since_previous);
+        let covariance = moved.by_pose * self.local_covariance * moved.by_pose.transpose() + moved.noise;
+        let prior = Prior { pose: moved.pose, covariance };
         if !(motion.is_finite() && is_finite(&prior.pose) && covariance.iter().all(|v| v.is_finite())) {
             self.counters.bad_motion = self.counters.bad_motion.saturating_add(1);
             if let Some(joint) = &mut self.joint {
@@ -327,13 +331,22 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             }
             return Prior { pose: self.map_from_base, covariance: Matrix3::identity() };
         }
-        if let Some(joint) = &mut self.joint {
-            let turn = self.map_from_base.rotation.to_rotation_matrix().to_homogeneous();
-            let by_odometry = turn * OdometryBias::derivative(&motion.since_previous);
-            joint.predict(&by_pose, &by_odometry, &noise, &mut self.map);
-        }
+        self.keyframe.since = self.keyframe.since.then(&motion.since_previous);
+        self.keyframe.scans = self.keyframe.scans.saturating_add(1);
         self.way_m += motion.since_previous.distance_m;
         prior
+    }
+
+    /// Where an increment of the odometry leads from a pose.
+    fn moved(&self, from: &Isometry2<f32>, increment: &Increment) -> Moved {
+        let increment = self.odometry_bias().corrected(increment);
+        // Rebuilt from its components, so that the rotation stays a rotation however many steps there were.
+        let c = components(&(from * increment.before_from_after));
+        let lever = perpendicular(from.rotation * increment.before_from_after.translation.vector);
+        let mut by_pose = Matrix3::identity();
+        (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
+        let noise = rotate_covariance(from, &self.config.odometry.noise.covariance(&increment));
+        Moved { pose: pose(c.x, c.y, c.z), by_pose, noise }
     }
 
     fn rejection(&self, scan: &Scan<'_>) -> Option<ScanRejection> {
@@ -510,18 +523,39 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
     }
 
+    /// Whether the scan at hand is to be taken into the map.
+    fn keyframe_is_due(&self) -> bool {
+        match &self.config.registration {
+            RegistrationConfig::EndPoints => true,
+            RegistrationConfig::Joint(config) => self.keyframe.is_due(self.counters.scans, &config.keyframes),
+        }
+    }
+
+    /// Moves the joint estimate's pose on by what the odometry said since the last keyframe. Returns it.
+    fn advance_joint(&mut self) -> Isometry2<f32> {
+        let last = self.keyframe;
+        let moved = self.moved(&last.map_from_base, &last.since);
+        if let Some(joint) = &mut self.joint {
+            let turn = last.map_from_base.rotation.to_rotation_matrix().to_homogeneous();
+            let by_odometry = turn * OdometryBias::derivative(&last.since);
+            joint.predict(&moved.by_pose, &by_odometry, &moved.noise, &mut self.map);
+        }
+        // Of no scan yet: the pose may have been corrected since.
+        self.keyframe = Keyframe { scans: 1, ..Keyframe::at(moved.pose) };
+        moved.pose
+    }
+
     /// From pairs to map, and with it, in the joint estimate, to the pose.
-    fn extend_map(&mut self, prior: &Prior, motion: &ScanMotion, update: &mut SlamUpdate) {
+    fn extend_map(&mut self, update: &mut SlamUpdate) {
         update.residual_m = self.residual_m(&update.pose);
+        if update.closure.is_none() && !self.keyframe_is_due() {
+            return;
+        }
+        let advanced = self.advance_joint();
         let seen = Observed {
             segments: &self.observed,
             pairs: &self.pairs,
             stamp: Stamp { scan: self.counters.scans, way_m: self.way_m },
-            moved_m: if motion.is_finite() {
-                motion.since_previous.distance_m + motion.since_previous.turn_rad
-            } else {
-                0.0
-            },
             line_noise: &self.config.line_noise,
         };
         let (RegistrationConfig::Joint(config), Some(joint)) = (&self.config.registration, &mut self.joint)
@@ -532,7 +566,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         // A closed loop has moved the prediction with the map.
         let carried = update.closure.map(|closure| closure.closed * closure.drifted.inverse());
         let start = Start {
-            prior: &carried.map_or(prior.pose, |closed_from_drifted| closed_from_drifted * prior.pose),
+            prior: &carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced),
             pose: &update.pose,
         };
         let (pose, report) = register_jointly(&seen, &start, config, joint, &mut self.map);
@@ -540,6 +574,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if is_finite(&pose) {
             update.pose = pose;
         }
+        self.keyframe = Keyframe::at(update.pose);
     }
 
     /// Forgets what the scan has seen through.
@@ -585,10 +620,19 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 }
 
+/// Where a motion leads.
+struct Moved {
+    pose: Isometry2<f32>,
+    /// Derivative of the new pose by the old one.
+    by_pose: Matrix3<f32>,
+    /// Covariance that the motion adds.
+    noise: Matrix3<f32>,
+}
+
 /// The prior's covariance with a heading error of `sigma_rad` on top, made half before and half after the motion.
 fn broadened(prior: &Prior, map_from_previous: &Isometry2<f32>, sigma_rad: f32) -> Matrix3<f32> {
     let moved = prior.pose.translation.vector - map_from_previous.translation.vector;
-    let lever = crate::pose::perpendicular(moved);
+    let lever = perpendicular(moved);
     let early = nalgebra::Vector3::new(lever.x, lever.y, 1.0);
     let late = nalgebra::Vector3::new(0.0, 0.0, 1.0);
     prior.covariance + (early * early.transpose() + late * late.transpose()) * (0.5 * sigma_rad * sigma_rad)

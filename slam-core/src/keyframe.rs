@@ -1,0 +1,91 @@
+//! Which scans the map is built from.
+//!
+//! Scans taken from nearly the same place share errors: corners cut alike, edges mixed alike. Taking in each of them would
+//! make the map sure of what they have in common, and would cost the most work where there is least to learn. So the joint
+//! estimate takes in a scan when the robot has moved on since the last one it took in, and now and then while it stands.
+//! The pose of every other scan is corrected against the map as the last keyframe left it.
+
+use nalgebra::{Isometry2, Matrix3};
+
+use crate::odometry::Increment;
+use crate::pose::perpendicular;
+
+/// When a scan becomes a keyframe.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct KeyframeConfig {
+    /// Way since the last keyframe from which on a scan is one, metres; a radian counts as a metre.
+    pub way_m: f32,
+    /// Scans since the last keyframe from which on a scan is one, wherever the robot is.
+    pub scans: u32,
+    /// All scans up to this number are keyframes: what is seen first says where the map's frame lies.
+    pub at_start: u32,
+}
+
+/// The last keyframe and the way since.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Keyframe {
+    /// Pose of `base` in `map` by the joint estimate.
+    pub map_from_base: Isometry2<f32>,
+    /// What the odometry said since, its systematic errors included.
+    pub since: Increment,
+    /// Scans since.
+    pub scans: u32,
+}
+
+impl Keyframe {
+    /// A keyframe just taken.
+    pub fn at(map_from_base: Isometry2<f32>) -> Self {
+        Self { map_from_base, since: Increment::identity(), scans: 0 }
+    }
+
+    /// Whether the robot has gone on far enough for another one; `number` is that of the scan.
+    pub fn is_due(&self, number: u32, config: &KeyframeConfig) -> bool {
+        number < config.at_start
+            || self.scans >= config.scans
+            || self.since.distance_m + self.since.turn_rad >= config.way_m
+    }
+
+    /// Covariance of a pose that lies firmly with the keyframe's, whose covariance is given.
+    pub fn carried(&self, covariance: &Matrix3<f32>, map_from_base: &Isometry2<f32>) -> Matrix3<f32> {
+        let lever = perpendicular(map_from_base.translation.vector - self.map_from_base.translation.vector);
+        let mut by_pose = Matrix3::identity();
+        (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
+        by_pose * covariance * by_pose.transpose()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pose::pose;
+
+    const CONFIG: KeyframeConfig = KeyframeConfig { way_m: 0.1, scans: 5, at_start: 2 };
+
+    #[test]
+    fn it_is_due_at_the_start_after_a_way_after_a_turn_and_after_a_while() {
+        let mut last = Keyframe::at(Isometry2::identity());
+        assert!(last.is_due(0, &CONFIG) && last.is_due(1, &CONFIG) && !last.is_due(2, &CONFIG));
+        // Back and forth is a way too.
+        for step in [0.06, -0.06] {
+            assert!(!last.is_due(9, &CONFIG));
+            last.since = last.since.then(&Increment::from_motion(pose(step, 0.0, 0.0)));
+        }
+        assert!(last.is_due(9, &CONFIG));
+        last = Keyframe::at(Isometry2::identity());
+        last.since = Increment::from_motion(pose(0.0, 0.0, -0.11));
+        assert!(last.is_due(9, &CONFIG));
+        last = Keyframe { scans: 5, ..Keyframe::at(Isometry2::identity()) };
+        assert!(last.is_due(9, &CONFIG));
+    }
+
+    #[test]
+    fn away_from_the_keyframe_its_heading_s_error_moves_the_robot() {
+        let keyframe = Keyframe::at(pose(1.0, 1.0, 0.3));
+        let covariance = Matrix3::from_diagonal(&nalgebra::Vector3::new(1e-4, 1e-4, 4e-4));
+        let carried = keyframe.carried(&covariance, &pose(3.0, 1.0, 0.0));
+        assert!((carried.m22 - (1e-4 + 4.0 * 4e-4)).abs() < 1e-8 && (carried.m11 - 1e-4).abs() < 1e-8);
+        assert!((carried.m23 - 2.0 * 4e-4).abs() < 1e-8);
+    }
+}
