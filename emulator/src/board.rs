@@ -3,6 +3,7 @@
 use std::num::{NonZeroU32, NonZeroU64};
 use std::sync::{Arc, Mutex};
 
+use anyhow::Context;
 use rigless::chip::Timeline;
 use rigless::chip::uart::Peer;
 use rigless::cpu::armv7m::windows;
@@ -21,6 +22,7 @@ use crate::room::Room;
 /// What the simulation and the chips on the board share.
 pub type Shared = Arc<Mutex<Room>>;
 
+/// At its fastest.
 const CLOCK_HZ: NonZeroU64 = NonZeroU64::new(180_000_000).expect("not zero");
 /// A Cortex-M4F retires an instruction in about 1.25 cycles of code like this, with the flash accelerator on: an
 /// assumption, stated and not measured here.
@@ -48,12 +50,22 @@ pub const URG_BRR: u64 = 0x4001_1408;
 pub struct Nucleo {
     /// The microcontroller: an STM32F427, which has all that the firmware uses of the STM32F429.
     pub mcu: Stm32f427,
+    instructions_per_second: NonZeroU64,
 }
 
 impl Nucleo {
+    /// The microcontroller alone, at another speed.
+    pub fn bare(instructions_per_second: u64) -> anyhow::Result<Self> {
+        let instructions_per_second =
+            NonZeroU64::new(instructions_per_second).context("a core that stands")?;
+        let mut mcu = Stm32f427::new()?;
+        mcu.set_supply(Supply(3300).0);
+        Ok(Self { mcu, instructions_per_second })
+    }
+
     /// Powered and wired, not yet running.
     pub fn new(shared: Shared) -> Result<Self, Error> {
-        let mut board = Self { mcu: Stm32f427::new()? };
+        let mut board = Self { mcu: Stm32f427::new()?, instructions_per_second: INSTRUCTIONS_PER_SECOND };
         board.mcu.rcc.attach_crystals(8_000_000, Crystal::NONE.0);
         board.mcu.set_supply(Supply(3300).0);
         board.mcu.usart[URG_PORT].attach(Urg { shared: shared.clone() });
@@ -136,7 +148,7 @@ impl Board for Nucleo {
             interrupt_lines: lines.expect("the part has interrupts"),
             priority_bits: 4,
             refclk_divider: REFCLK_DIVIDER,
-            instructions_per_second: INSTRUCTIONS_PER_SECOND,
+            instructions_per_second: self.instructions_per_second,
             boot: "flash",
         };
         let core = core.spec_with_parts(

@@ -19,16 +19,22 @@ pub struct Symbols {
 impl Symbols {
     /// Reads them from the ELF.
     pub fn read(elf: &[u8], path: &Path) -> anyhow::Result<Self> {
-        use object::{Object, ObjectSymbol};
-        let file = object::File::parse(elf).with_context(|| path.display().to_string())?;
-        let find = |name: &str| {
-            let symbol = file.symbols().find(|s| s.name() == Ok(name));
-            symbol
-                .map(|s| s.address())
-                .with_context(|| format!("{}: there is no symbol {name}", path.display()))
-        };
-        Ok(Self { rtt: find("_SEGGER_RTT")?, trace: find("TRACE")? })
+        Ok(Self { rtt: address_of(RTT, elf, path)?, trace: address_of("TRACE", elf, path)? })
     }
+
+    /// The control block of RTT of any firmware.
+    pub fn rtt(elf: &[u8], path: &Path) -> anyhow::Result<u64> {
+        address_of(RTT, elf, path)
+    }
+}
+
+const RTT: &str = "_SEGGER_RTT";
+
+fn address_of(name: &str, elf: &[u8], path: &Path) -> anyhow::Result<u64> {
+    use object::{Object, ObjectSymbol};
+    let file = object::File::parse(elf).with_context(|| path.display().to_string())?;
+    let symbol = file.symbols().find(|s| s.name() == Ok(name));
+    symbol.map(|s| s.address()).with_context(|| format!("{}: there is no symbol {name}", path.display()))
 }
 
 /// A line of the log.

@@ -3,6 +3,7 @@
 //! [`run::run`] runs a firmware; [`report`] judges what it left. Nothing of the map is computed here: trajectory and map
 //! are read from the firmware.
 
+pub mod bench;
 pub mod board;
 pub mod fault;
 pub mod firmware;

@@ -8,7 +8,7 @@ use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::Increment;
 use slam_core::pose::pose;
 use slam_core::slam::Counters;
-use slam_core::{OdometryTrack, Scan, Slam, SlamConfig, SlamUpdate};
+use slam_core::{OdometryTrack, Scan, ScanMotion, Slam, SlamConfig, SlamUpdate};
 
 use crate::log::{Log, Odometry};
 use crate::robot::Robot;
@@ -60,6 +60,8 @@ pub struct Step {
     pub odometry: Isometry2<f32>,
     /// All that the core said.
     pub update: SlamUpdate,
+    /// How the robot moved for it, by odometry.
+    pub motion: ScanMotion,
     /// Time the core took.
     pub took: Duration,
     /// Points of the scan in `base`.
@@ -146,6 +148,7 @@ fn run_sized<const BEAMS: usize>(
             pose_in_final_map: update.pose,
             odometry,
             update,
+            motion,
             took,
             points: slam.points().iter().map(|p| p.position).collect(),
         });

@@ -71,6 +71,18 @@ impl<const N: usize> SegmentMap<N> {
         self.counters
     }
 
+    /// Begins anew with these segments, which have not been seen yet by any scan to come.
+    pub(crate) fn take_up(&mut self, segments: &[MapSegment]) {
+        self.segments.clear();
+        for entry in segments {
+            if !entry.segment.is_finite()
+                || self.segments.push(MapSegment { last_seen: 0, seen_at_m: 0.0, ..*entry }).is_err()
+            {
+                self.counters.refused = self.counters.refused.saturating_add(1);
+            }
+        }
+    }
+
     pub(crate) fn get_mut(&mut self, index: usize) -> Option<&mut MapSegment> {
         self.segments.get_mut(index)
     }

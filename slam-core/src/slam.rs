@@ -16,7 +16,7 @@ use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
 use crate::keyframe::Keyframe;
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
-use crate::map::{MapCounters, SegmentMap};
+use crate::map::{MapCounters, MapSegment, SegmentMap};
 use crate::math::{sqrt, within, wrap_angle};
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
@@ -86,6 +86,38 @@ pub enum ScanRejection {
         /// Ranges given.
         actual: usize,
     },
+}
+
+/// What the core is at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Stage {
+    /// Where the odometry leads.
+    Prediction,
+    /// Ranges to points.
+    Deskew,
+    /// Points to segments.
+    Extraction,
+    /// Segments to pairs.
+    Association,
+    /// Pairs to pose.
+    Correction,
+    /// Pairs to map.
+    Registration,
+}
+
+impl Stage {
+    /// All of them, in the order of the pipeline.
+    pub const ALL: [Self; 6] = [
+        Self::Prediction,
+        Self::Deskew,
+        Self::Extraction,
+        Self::Association,
+        Self::Correction,
+        Self::Registration,
+    ];
+    /// How many there are.
+    pub const COUNT: usize = Self::ALL.len();
 }
 
 /// Outcome of one scan.
@@ -233,6 +265,17 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// Never panics, whatever the numbers: what cannot be used is counted, see [`Counters`] and
     /// [`SlamUpdate::rejected`].
     pub fn process_scan(&mut self, scan: &Scan<'_>, motion: &ScanMotion) -> SlamUpdate {
+        self.process_scan_watched(scan, motion, &mut |_| ())
+    }
+
+    /// The same, for whoever measures: `watch` is told each [`Stage`] as it begins, [`Stage::Prediction`] excepted, which is
+    /// the first. Association and correction take turns.
+    pub fn process_scan_watched(
+        &mut self,
+        scan: &Scan<'_>,
+        motion: &ScanMotion,
+        watch: &mut impl FnMut(Stage),
+    ) -> SlamUpdate {
         let prior = self.predict(motion);
         let mut update = SlamUpdate {
             pose: prior.pose,
@@ -253,11 +296,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             map_counters: self.map.counters(),
         };
         if update.rejected.is_none() {
-            self.observe(scan, motion, &mut update);
-            self.correct(&prior, motion, &mut update);
+            self.observe(scan, motion, &mut update, watch);
+            self.correct(&prior, motion, &mut update, watch);
             if let Some(config) = self.config.loop_closure {
-                self.close_loop(&config, &mut update);
+                self.close_loop(&config, &mut update, watch);
             }
+            watch(Stage::Registration);
             self.extend_map(&mut update);
             if update.registration.keyframe {
                 self.forget(scan, &update);
@@ -282,6 +326,19 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             self.advance_joint();
         }
         prior.pose
+    }
+
+    /// Takes up a map made before, with the robot at a pose in it that is taken as certain. Segments beyond the capacity are left out, and
+    /// counted as refused.
+    pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {
+        self.map.take_up(map);
+        self.map_from_base = map_from_base;
+        self.local_covariance = Matrix3::zeros();
+        self.keyframe = Keyframe::at(map_from_base);
+        let sigmas = self.odometry_sigmas();
+        if let Some(joint) = &mut self.joint {
+            joint.clear(sigmas);
+        }
     }
 
     /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.
@@ -355,22 +412,37 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// Ranges to segments in `base`.
-    fn observe(&mut self, scan: &Scan<'_>, motion: &ScanMotion, update: &mut SlamUpdate) {
+    fn observe(
+        &mut self,
+        scan: &Scan<'_>,
+        motion: &ScanMotion,
+        update: &mut SlamUpdate,
+        watch: &mut impl FnMut(Stage),
+    ) {
+        watch(Stage::Deskew);
         let still = ScanMotion::instantaneous(motion.since_previous);
         let motion = if motion.is_finite() { motion } else { &still };
         let (sensor, config) = (&self.config.sensor, &self.config);
         update.deskew = deskew(scan, motion, sensor, &config.deskew, &self.bearings, &mut self.points);
+        watch(Stage::Extraction);
         update.extraction =
             extract(&self.points, sensor, &config.extraction, self.counters.scans, &mut self.observed);
     }
 
     /// From the prediction to the corrected pose.
-    fn correct(&mut self, prior: &Prior, motion: &ScanMotion, update: &mut SlamUpdate) {
+    fn correct(
+        &mut self,
+        prior: &Prior,
+        motion: &ScanMotion,
+        update: &mut SlamUpdate,
+        watch: &mut impl FnMut(Stage),
+    ) {
+        watch(Stage::Association);
         self.find_candidates(&prior.pose);
         let predicted = *update;
-        self.refine(prior, update);
+        self.refine(prior, update, watch);
         if let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction {
-            self.search_heading(prior, motion, &config.search, &predicted, update);
+            self.search_heading(prior, motion, &config.search, &predicted, update, watch);
         }
     }
 
@@ -384,13 +456,15 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// Rounds of association and correction from the pose of `update`.
-    fn refine(&mut self, prior: &Prior, update: &mut SlamUpdate) {
+    fn refine(&mut self, prior: &Prior, update: &mut SlamUpdate, watch: &mut impl FnMut(Stage)) {
         let rounds = match &self.config.correction {
             CorrectionConfig::LeastSquares => 1,
             CorrectionConfig::MaximumAPosteriori(config) => config.max_iterations,
         };
         for _ in 0..rounds {
+            watch(Stage::Association);
             self.associate(update);
+            watch(Stage::Correction);
             update.iterations = update.iterations.saturating_add(1);
             let Some(correction) = self.step(prior, &update.pose) else { break };
             update.corrected |= !self.pairs.is_empty();
@@ -413,6 +487,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         config: &SearchConfig,
         predicted: &SlamUpdate,
         best: &mut SlamUpdate,
+        watch: &mut impl FnMut(Stage),
     ) {
         if best.support >= config.below_support || self.candidates.is_empty() {
             return;
@@ -431,7 +506,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
                 let offset = side * f32::from(turn) * config.step_rad;
                 hypothesis.pose = pose(centre.x, centre.y, centre.z + offset);
                 hypothesis.covariance = broad.covariance;
-                self.refine(&broad, &mut hypothesis);
+                self.refine(&broad, &mut hypothesis, watch);
                 let least = winner.as_ref().map_or(best.support + config.gain, |w| w.support);
                 if hypothesis.support > least {
                     winner = Some(hypothesis);
@@ -444,11 +519,13 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
                 joint.loosen_pose(&(broad.covariance - prior.covariance), &mut self.map);
             }
         }
+        watch(Stage::Association);
         self.associate(best);
     }
 
     /// Recognises old parts of the map from which the pose has drifted, and closes the loop.
-    fn close_loop(&mut self, config: &LoopConfig, update: &mut SlamUpdate) {
+    fn close_loop(&mut self, config: &LoopConfig, update: &mut SlamUpdate, watch: &mut impl FnMut(Stage)) {
+        watch(Stage::Association);
         let (map, way_m) = (self.map.segments(), self.way_m);
         let age = |i: &u16| map.get(usize::from(*i)).map_or(0.0, |s| way_m - s.seen_at_m);
         let all = self.candidates.clone();
@@ -460,7 +537,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let prior = Prior { pose: update.pose, covariance: update.covariance + drift(config, oldest) };
         let mut hypothesis = *update;
         hypothesis.covariance = prior.covariance;
-        self.refine(&prior, &mut hypothesis);
+        self.refine(&prior, &mut hypothesis, watch);
         self.candidates = all;
         let seen =
             hypothesis.observability.verdict == Verdict::Full && hypothesis.support >= config.min_support;
@@ -484,6 +561,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         } else {
             self.closing = PendingClosure::default();
         }
+        watch(Stage::Association);
         self.associate(update);
         update.support = self.support();
     }

@@ -8,9 +8,10 @@
 
 pub mod ransac;
 pub mod split;
+mod strip;
 
 use heapless::VecView;
-use nalgebra::{Point2, Vector2};
+use nalgebra::Point2;
 
 pub use ransac::RansacConfig;
 pub use split::SplitConfig;
@@ -85,16 +86,6 @@ impl Collector<'_> {
     }
 }
 
-/// Variance of a point across a surface with this unit normal, m²: range noise acts along the beam, the beam's own
-/// uncertain bearing and its width across it.
-pub(crate) fn variance_across(point: &ScanPoint, normal: Vector2<f32>, view: &Viewpoint<'_>) -> f32 {
-    let (noise, range2) = (&view.sensor.noise, point.range_m * point.range_m);
-    let along_beam = normal.dot(&(point.position - view.position));
-    let cos2 = (along_beam * along_beam / range2).min(1.0);
-    noise.variance(point.range_m) * cos2
-        + noise.sigma_bearing_rad * noise.sigma_bearing_rad * range2 * (1.0 - cos2)
-}
-
 /// The sensor and where it stood at the middle beam, in `base`.
 pub(crate) struct Viewpoint<'a> {
     pub sensor: &'a SensorConfig,
@@ -112,7 +103,18 @@ mod tests {
     use super::*;
     use crate::SlamConfig;
     use heapless::Vec;
+    use nalgebra::Vector2;
     use std::vec::Vec as StdVec;
+
+    /// Variance of a point across a surface with this unit normal, m², written plainly: range noise acts along the beam, the beam's own
+    /// uncertain bearing and its width across it.
+    pub(super) fn variance_across(point: &ScanPoint, normal: Vector2<f32>, view: &Viewpoint<'_>) -> f32 {
+        let (noise, range2) = (&view.sensor.noise, point.range_m * point.range_m);
+        let along_beam = normal.dot(&(point.position - view.position));
+        let cos2 = (along_beam * along_beam / range2).min(1.0);
+        noise.variance(point.range_m) * cos2
+            + noise.sigma_bearing_rad * noise.sigma_bearing_rad * range2 * (1.0 - cos2)
+    }
 
     /// Both ends.
     type Wall = ((f32, f32), (f32, f32));
@@ -143,7 +145,7 @@ mod tests {
         points
     }
 
-    fn sensor() -> SensorConfig {
+    pub(super) fn sensor() -> SensorConfig {
         let mut sensor = SlamConfig::default().sensor;
         sensor.mounting.base_from_laser = nalgebra::Isometry2::identity();
         sensor

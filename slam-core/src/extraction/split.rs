@@ -9,12 +9,12 @@
 //! split-and-merge fastest and among the most correct. The chi-square tests are ours.
 
 use heapless::Vec;
-use nalgebra::{Point2, Vector2};
+use nalgebra::Point2;
 
-use super::{Collector, Viewpoint, variance_across};
+use super::strip::{Frame, Sums, VarianceAcross};
+use super::{Collector, Viewpoint};
 use crate::deskew::ScanPoint;
 use crate::math::{sin_cos, sqrt};
-use crate::pose::perpendicular;
 use crate::segment::{Moments, Segment};
 
 /// Pieces waiting to be looked at. Each split adds one; deeper clusters give up their smallest detail.
@@ -24,7 +24,7 @@ const STACK: usize = 32;
 const FAR_SHARE: f32 = 0.8;
 /// Readings this many standard deviations within the sensor's range are not lost.
 const LOST_SIGMAS: f32 = 4.0;
-/// Parts of a piece between which a cut is looked for first.
+/// Parts of a piece, at least, between which a cut is looked for first; of a short one there are up to twice as many.
 const PARTS: usize = 8;
 /// Fewest points on either side of such a cut.
 const LEAST_PART: usize = 3;
@@ -58,8 +58,20 @@ pub struct SplitConfig {
     pub max_sigma_direction_rad: f32,
 }
 
-/// Extracts segments. Work: two passes over the points for each level of splitting, at most points² in all when every
-/// split takes off a single point.
+/// χ² with two degrees of freedom that chance reaches once in a hundred times: what a second line saves without need.
+const CHANCE_CHI2: f32 = 9.0;
+
+/// What stays the same for a scan.
+struct Extraction<'a> {
+    view: &'a Viewpoint<'a>,
+    config: &'a SplitConfig,
+    variance: VarianceAcross,
+    /// Distance of neighbouring points of a surface seen at the flattest angle, metres for each metre of range.
+    spacing_per_m: f32,
+}
+
+/// Extracts segments. Work: two passes over the points, one more for each level of splitting; at most points² in all, when
+/// every split takes off a single point.
 pub(crate) fn extract(
     points: &[ScanPoint],
     view: &Viewpoint<'_>,
@@ -68,225 +80,212 @@ pub(crate) fn extract(
 ) {
     let sin_incidence = sin_cos(config.min_incidence_rad).0.max(1e-3);
     let spacing_per_m = view.sensor.geometry.step_rad() / sin_incidence;
+    let extraction = Extraction { view, config, variance: VarianceAcross::new(view), spacing_per_m };
     let mut rest = points;
     while !rest.is_empty() {
-        let length = 1 + rest
-            .iter()
-            .zip(rest.iter().skip(1))
-            .take_while(|(a, b)| joined(a, b, view, config, spacing_per_m))
-            .count();
+        let pairs = rest.iter().zip(rest.iter().skip(1));
+        let length = 1 + pairs.take_while(|(a, b)| extraction.joined(a, b)).count();
         let (cluster, tail) = rest.split_at(length.min(rest.len()));
-        split_cluster(cluster, view, config, out);
+        extraction.split_cluster(cluster, out);
         rest = tail;
     }
 }
 
-/// Whether two neighbouring points may lie on one surface.
-fn joined(
-    a: &ScanPoint,
-    b: &ScanPoint,
-    view: &Viewpoint<'_>,
-    config: &SplitConfig,
-    spacing_per_m: f32,
-) -> bool {
-    let beams = b.beam.saturating_sub(a.beam);
-    let spacing_m = spacing_per_m * a.range_m.min(b.range_m) * f32::from(beams);
-    // Noise alone sets neighbours √2·σ apart along the beam; a wall must not end where it happens to.
-    let noise_m = config.split_sigmas * sqrt(2.0 * view.sensor.noise.variance(a.range_m.min(b.range_m)));
-    let limit_m = config.max_gap_m.max(spacing_m) + noise_m;
-    beams <= config.max_missing_beams.saturating_add(1)
-        && (b.position - a.position).norm_squared() <= limit_m * limit_m
-}
-
-fn split_cluster(cluster: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConfig, out: &mut Collector<'_>) {
-    if (cluster.len() as u32) < config.min_inliers {
-        return;
+impl Extraction<'_> {
+    /// Whether two neighbouring points may lie on one surface.
+    fn joined(&self, a: &ScanPoint, b: &ScanPoint) -> bool {
+        let beams = b.beam.saturating_sub(a.beam);
+        if beams > self.config.max_missing_beams.saturating_add(1) {
+            return false;
+        }
+        let range_m = a.range_m.min(b.range_m);
+        let gap_m = self.config.max_gap_m.max(self.spacing_per_m * range_m * f32::from(beams));
+        let apart2 = (b.position - a.position).norm_squared();
+        if apart2 <= gap_m * gap_m {
+            return true;
+        }
+        // Noise alone sets neighbours √2·σ apart along the beam; a wall must not end where it happens to.
+        let variance = 2.0 * self.view.sensor.noise.variance(range_m);
+        let limit_m = gap_m + self.config.split_sigmas * sqrt(variance);
+        apart2 <= limit_m * limit_m
     }
-    let mut stack: Vec<(usize, usize), STACK> = Vec::new();
-    // The piece that may still grow at its end.
-    let mut open: Option<(usize, usize, Moments)> = None;
-    let mut next = Some((0, cluster.len()));
-    while let Some((from, to)) = next.or_else(|| stack.pop()) {
-        next = None;
-        let Some(points) = cluster.get(from..to) else { break };
-        if let Some(cut) =
-            farthest_from_chord(points, view, config.split_sigmas).or_else(|| two_lines(points, view, config))
-            && stack.push((from + cut, to)).is_ok()
+
+    fn split_cluster(&self, cluster: &[ScanPoint], out: &mut Collector<'_>) {
+        if (cluster.len() as u32) < self.config.min_inliers {
+            return;
+        }
+        let mut stack: Vec<(usize, usize), STACK> = Vec::new();
+        // The piece that may still grow at its end.
+        let mut open: Option<(usize, usize, Moments)> = None;
+        let mut next = Some((0, cluster.len()));
+        while let Some((from, to)) = next.or_else(|| stack.pop()) {
+            next = None;
+            let Some(points) = cluster.get(from..to) else { break };
+            let moments = match self.cut_or_sums(points) {
+                Ok(cut) if stack.push((from + cut, to)).is_ok() => {
+                    next = Some((from, from + cut));
+                    continue;
+                }
+                Ok(_) => self.chord_moments(points),
+                Err(moments) => moments,
+            };
+            open = match open {
+                Some((open_from, _, sums)) if is_one_line(&sums, &moments, self.config) => {
+                    Some((open_from, to, sums.merged(&moments)))
+                }
+                // A point or two off the line are noise until the next piece says otherwise.
+                Some(line) if points.len() <= MOST_STRAYS && line.1 + MOST_STRAYS >= to => Some(line),
+                closed => {
+                    self.close(cluster, closed, out);
+                    Some((from, to, moments))
+                }
+            };
+        }
+        self.close(cluster, open, out);
+    }
+
+    fn close(&self, cluster: &[ScanPoint], open: Option<(usize, usize, Moments)>, out: &mut Collector<'_>) {
+        if let Some((from, to, moments)) = open
+            && let Some(points) = cluster.get(from..to)
         {
-            next = Some((from, from + cut));
-            continue;
+            self.finish(points, &moments, out);
         }
-        let moments = chord_moments(points, view);
-        open = match open {
-            Some((open_from, _, sums)) if is_one_line(&sums, &moments, config) => {
-                Some((open_from, to, sums.merged(&moments)))
+    }
+
+    /// Where to cut a piece, or its sums if it is straight.
+    fn cut_or_sums(&self, points: &[ScanPoint]) -> Result<usize, Moments> {
+        let Some(frame) = Frame::of_chord(points, self.view) else { return Err(self.chord_moments(points)) };
+        match self.farthest_from_chord(points, &frame) {
+            Some(cut) => Ok(cut),
+            None => self.two_lines(points, &frame),
+        }
+    }
+
+    /// Weighted sums over a run of points whose surface lies along its chord.
+    fn chord_moments(&self, points: &[ScanPoint]) -> Moments {
+        let Some(first) = points.first() else { return Moments::EMPTY };
+        // A run that ends where it began has no surface; any direction serves.
+        let frame =
+            Frame::of_chord(points, self.view).unwrap_or_else(|| Frame::of_point(first.position, self.view));
+        frame.moments(&frame.sums(points, &self.variance))
+    }
+
+    /// Index at which to cut: the point farthest from the chord, in standard deviations, if any is too far off.
+    fn farthest_from_chord(&self, points: &[ScanPoint], frame: &Frame) -> Option<usize> {
+        let inner = points.get(1..points.len().checked_sub(1)?)?;
+        let (mut worst, mut cut) = (self.config.split_sigmas * self.config.split_sigmas, None);
+        for (i, point) in inner.iter().enumerate() {
+            let off = frame.off(point);
+            let range2 = point.range_m * point.range_m;
+            let distance = frame.distance_m + off;
+            let scaled = self.variance.times_range2(range2, distance * distance);
+            let off2 = off * off * range2;
+            if off2 > worst * scaled {
+                (worst, cut) = (off2 / scaled, Some(i + 1));
             }
-            // A point or two off the line are noise until the next piece says otherwise.
-            Some(line) if points.len() <= MOST_STRAYS && line.1 + MOST_STRAYS >= to => Some(line),
-            closed => {
-                close(cluster, closed, view, config, out);
-                Some((from, to, moments))
-            }
+        }
+        cut
+    }
+
+    /// Index at which to cut a piece that two lines fit better than one: a step in a wall, too low for any single point
+    /// to show it. Otherwise the sums over the piece.
+    fn two_lines(&self, points: &[ScanPoint], frame: &Frame) -> Result<usize, Moments> {
+        let coarse = (points.len() / PARTS).max(1);
+        // Over the points before each place where a cut is looked for first.
+        let mut before: Vec<Sums, { 2 * PARTS }> = Vec::new();
+        let mut all = Sums::default();
+        for part in points.chunks(coarse) {
+            // Fewer parts than twice PARTS: a piece shorter than that has parts of one point each.
+            let _ = before.push(all);
+            part.iter().for_each(|point| frame.add(point, &self.variance, &mut all));
+        }
+        let total = all.residual();
+        // No cut saves more than all there is.
+        if total <= CHANCE_CHI2 {
+            return Err(frame.moments(&all));
+        }
+        let mut best: Option<(usize, f32)> = None;
+        for (part, first) in before.iter().enumerate() {
+            self.consider(part * coarse, first, &all, total, &mut best);
+        }
+        let Some((near, _)) = best else { return Err(frame.moments(&all)) };
+        let from = near.saturating_sub(coarse);
+        let mut first = before.get(from / coarse).copied().unwrap_or_default();
+        best = None;
+        for (i, point) in points.iter().enumerate().skip(from).take(2 * coarse - 1) {
+            frame.add(point, &self.variance, &mut first);
+            self.consider(i + 1, &first, &all, total, &mut best);
+        }
+        best.map(|(cut, _)| cut).ok_or_else(|| frame.moments(&all))
+    }
+
+    /// Takes a cut for the best if it is: given are the sums before it and over all, and the χ² of all.
+    fn consider(&self, cut: usize, first: &Sums, all: &Sums, total: f32, best: &mut Option<(usize, f32)>) {
+        let second = all.without(first);
+        let fewer = first.inliers.min(second.inliers);
+        if (fewer as usize) < LEAST_PART {
+            return;
+        }
+        let saved = total - first.residual() - second.residual();
+        if saved > joining_limit(fewer, self.config) && best.is_none_or(|(_, most)| saved >= most) {
+            *best = Some((cut, saved));
+        }
+    }
+
+    /// Whether the line lies so near the end of the sensor's range at a point that farther readings of it were lost: what
+    /// remains there is too near on average.
+    fn beyond_sight(&self, point: &ScanPoint, off: f32, frame: &Frame) -> bool {
+        let max_m = f32::from(self.view.sensor.codes.max_mm) * 1e-3;
+        if point.range_m < FAR_SHARE * max_m {
+            return false;
+        }
+        let line_range_m = point.range_m * frame.distance_m / (frame.distance_m + off);
+        let limit_m = max_m - LOST_SIGMAS * sqrt(self.view.sensor.noise.variance(max_m));
+        line_range_m > limit_m
+    }
+
+    /// Trims the ends, tests and keeps a piece.
+    fn finish(&self, points: &[ScanPoint], fit: &Moments, out: &mut Collector<'_>) {
+        let config = self.config;
+        if fit.inliers < config.min_inliers {
+            return;
+        }
+        let frame = Frame::of_fit(fit, self.view);
+        let off_line = |point: &&ScanPoint| {
+            let off = frame.off(point);
+            let (range2, distance) = (point.range_m * point.range_m, frame.distance_m + off);
+            let limit = config.trim_sigmas
+                * config.trim_sigmas
+                * self.variance.times_range2(range2, distance * distance);
+            off * off * range2 > limit || self.beyond_sight(point, off, &frame)
         };
-    }
-    close(cluster, open, view, config, out);
-}
-
-fn close(
-    cluster: &[ScanPoint],
-    open: Option<(usize, usize, Moments)>,
-    view: &Viewpoint<'_>,
-    config: &SplitConfig,
-    out: &mut Collector<'_>,
-) {
-    if let Some((from, to, moments)) = open
-        && let Some(points) = cluster.get(from..to)
-    {
-        finish(points, &moments, view, config, out);
-    }
-}
-
-/// Index at which to cut: the point farthest from the chord, if any is more than `sigmas` standard deviations off.
-fn farthest_from_chord(points: &[ScanPoint], view: &Viewpoint<'_>, sigmas: f32) -> Option<usize> {
-    let first = points.first()?;
-    let normal = chord_normal(points)?;
-    if points.len() < 3 {
-        return None;
-    }
-    let (mut worst, mut cut) = (sigmas * sigmas, None);
-    for (i, point) in points.iter().enumerate().skip(1).take(points.len() - 2) {
-        let off = normal.dot(&(point.position - first.position));
-        let chi2 = off * off / variance_across(point, normal, view);
-        if chi2 > worst {
-            (worst, cut) = (chi2, Some(i));
+        let leading = points.iter().take_while(off_line).count();
+        let trailing = points.iter().rev().take_while(off_line).count();
+        let Some(kept) = points.get(leading..points.len().saturating_sub(trailing)) else { return };
+        let sums = frame.refined_sums(kept, self.view, &self.variance, config.split_sigmas);
+        let moments = frame.moments(&sums);
+        let (Some(first), Some(last)) = (kept.first(), kept.last()) else { return };
+        let ends: [Point2<f32>; 2] = [first.position, last.position];
+        let segment = Segment::fitted(moments, &ends, self.view.position);
+        let straight = sums.residual() <= config.max_mean_chi2 * moments.inliers as f32;
+        let directed = moments.scatter_along(segment.direction)
+            * config.max_sigma_direction_rad
+            * config.max_sigma_direction_rad
+            >= 1.0;
+        let long = moments.inliers >= config.min_inliers && segment.length_m() >= config.min_length_m;
+        if long && straight && directed {
+            out.push(segment);
         }
     }
-    cut
-}
-
-/// Index at which to cut a piece that two lines fit better than one: a step in a wall, too low for any single point to
-/// show it.
-fn two_lines(points: &[ScanPoint], view: &Viewpoint<'_>, config: &SplitConfig) -> Option<usize> {
-    let coarse = (points.len() / PARTS).max(1);
-    let normal = chord_normal(points)?;
-    let all = weighed_moments(points, normal, view);
-    // χ² saved by two lines over what two lines of chance would save; positive where a cut is due.
-    let saved = |cut: usize| {
-        let (a, b) = points.split_at_checked(cut).filter(|(a, b)| a.len().min(b.len()) >= LEAST_PART)?;
-        let (a, b) = (weighed_moments(a, normal, view), weighed_moments(b, normal, view));
-        let cost = all.residual() - a.residual() - b.residual();
-        let due = cost - joining_limit(&a, &b, config);
-        (due > 0.0).then_some((cut, cost))
-    };
-    let best = |cuts: &mut dyn Iterator<Item = usize>| {
-        cuts.filter_map(saved).max_by(|a, b| a.1.total_cmp(&b.1)).map(|(cut, _)| cut)
-    };
-    let near = best(&mut (coarse..points.len()).step_by(coarse))?;
-    best(&mut (near.saturating_sub(coarse) + 1..near + coarse))
-}
-
-/// Unit normal of the line through the first and last point; `None` where they coincide.
-fn chord_normal(points: &[ScanPoint]) -> Option<Vector2<f32>> {
-    let chord = perpendicular(points.last()?.position - points.first()?.position);
-    let length = sqrt(chord.norm_squared());
-    (length > 0.0).then(|| chord / length)
-}
-
-/// Weighted sums over a run of points whose surface lies along its chord.
-fn chord_moments(points: &[ScanPoint], view: &Viewpoint<'_>) -> Moments {
-    // A run that ends where it began has no surface; x serves as well as any.
-    let normal = chord_normal(points).unwrap_or_else(Vector2::x);
-    weighed_moments(points, normal, view)
-}
-
-/// Sums over points of a surface with this normal, each weighed by its noise across it.
-fn weighed_moments(points: &[ScanPoint], normal: Vector2<f32>, view: &Viewpoint<'_>) -> Moments {
-    Moments::from_points(points.iter().map(|p| (p.position, 1.0 / variance_across(p, normal, view))))
 }
 
 /// Whether two neighbouring pieces are one line: their common fit must not be worse than their own.
 fn is_one_line(a: &Moments, b: &Moments, config: &SplitConfig) -> bool {
     let cost = a.merged(b).residual() - a.residual() - b.residual();
-    cost <= joining_limit(a, b, config)
+    cost <= joining_limit(a.inliers.min(b.inliers), config)
 }
 
-/// χ² that joining two pieces of one line may cost.
-fn joining_limit(a: &Moments, b: &Moments, config: &SplitConfig) -> f32 {
-    // 9: the 99 % point of χ² with the two degrees of freedom that a second line has.
-    (config.merge_chi2 * a.inliers.min(b.inliers) as f32).max(9.0)
-}
-
-/// Sums over the points of a line that is nearly known, free of two biases of a plain fit.
-///
-/// Range noise moves a point along its beam: off the line, and along it by an amount that depends on the first. Seen at an
-/// angle, that correlation turns a total-least-squares line by σ²·sinβ·cosβ over the variance along it, always the
-/// same way. So each point is taken where its beam meets the known line, off it by what it was off. And the noise is taken
-/// for the range of the known line: taken for the range measured, points too near would weigh more.
-fn refined(points: &[ScanPoint], line: &Moments, view: &Viewpoint<'_>, config: &SplitConfig) -> Moments {
-    let normal = perpendicular(line.direction());
-    let to_line = normal.dot(&(line.centroid - view.position));
-    let on_line = points.iter().filter_map(|point| {
-        let from_view = point.position - view.position;
-        let share = to_line / normal.dot(&from_view);
-        let known = ScanPoint {
-            position: view.position + from_view * share,
-            range_m: point.range_m * share,
-            ..*point
-        };
-        let off = normal.dot(&(point.position - line.centroid));
-        let variance = variance_across(&known, normal, view);
-        let stray = off * off > config.split_sigmas * config.split_sigmas * variance;
-        (variance.is_finite() && !stray).then(|| (known.position + normal * off, 1.0 / variance))
-    });
-    Moments::from_points(on_line)
-}
-
-/// Whether the line lies so near the end of the sensor's range at a point that farther readings of it were lost: what
-/// remains there is too near on average.
-fn beyond_sight(point: &ScanPoint, normal: Vector2<f32>, line: &Moments, view: &Viewpoint<'_>) -> bool {
-    let max_m = f32::from(view.sensor.codes.max_mm) * 1e-3;
-    if point.range_m < FAR_SHARE * max_m {
-        return false;
-    }
-    let along_beam = normal.dot(&(point.position - view.position));
-    let to_line = normal.dot(&(line.centroid - view.position));
-    let line_range_m = point.range_m * to_line / along_beam;
-    let limit_m = max_m - LOST_SIGMAS * sqrt(view.sensor.noise.variance(max_m));
-    line_range_m > limit_m
-}
-
-/// Trims the ends, tests and keeps a piece.
-fn finish(
-    points: &[ScanPoint],
-    fit: &Moments,
-    view: &Viewpoint<'_>,
-    config: &SplitConfig,
-    out: &mut Collector<'_>,
-) {
-    if fit.inliers < config.min_inliers {
-        return;
-    }
-    let normal = perpendicular(fit.direction());
-    let off_line = |point: &ScanPoint| {
-        let off = normal.dot(&(point.position - fit.centroid));
-        let limit = config.trim_sigmas * config.trim_sigmas * variance_across(point, normal, view);
-        off * off > limit || beyond_sight(point, normal, fit, view)
-    };
-    let leading = points.iter().take_while(|p| off_line(p)).count();
-    let trailing = points.iter().rev().take_while(|p| off_line(p)).count();
-    let Some(kept) = points.get(leading..points.len().saturating_sub(trailing)) else { return };
-    let moments = refined(kept, fit, view, config);
-    let moments = refined(kept, &moments, view, config);
-    let (Some(first), Some(last)) = (kept.first(), kept.last()) else { return };
-    let ends: [Point2<f32>; 2] = [first.position, last.position];
-    let segment = Segment::fitted(moments, &ends, view.position);
-    let straight = moments.residual() <= config.max_mean_chi2 * moments.inliers as f32;
-    let directed = moments.scatter_along(segment.direction)
-        * config.max_sigma_direction_rad
-        * config.max_sigma_direction_rad
-        >= 1.0;
-    let long = moments.inliers >= config.min_inliers && segment.length_m() >= config.min_length_m;
-    if long && straight && directed {
-        out.push(segment);
-    }
+/// χ² that joining two pieces of one line may cost, by the points of the smaller.
+fn joining_limit(fewer: u32, config: &SplitConfig) -> f32 {
+    (config.merge_chi2 * fewer as f32).max(CHANCE_CHI2)
 }

@@ -1,0 +1,159 @@
+//! The measurements.
+
+use core::hint::black_box;
+use core::mem::MaybeUninit;
+
+use cortex_m::peripheral::DWT;
+use defmt_rtt as _;
+use nalgebra::{Point2, Vector2};
+use panic_probe as _;
+use slam_core::odometry::Increment;
+use slam_core::odometry_track::SWEEP_KNOTS;
+use slam_core::pose::pose;
+use slam_core::segment::Moments;
+use slam_core::slam::Stage;
+use slam_core::{MapSegment, Scan, ScanMotion, Segment, Slam, SlamConfig};
+
+include!(concat!(env!("OUT_DIR"), "/set.rs"));
+
+/// Room for segments: that of the firmware.
+const CAPACITY: usize = 512;
+/// Segments known at the start of a run.
+const KNOWN: [usize; 3] = [50, 200, 500];
+/// Times that a function is called.
+const CALLS: u32 = 64;
+
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    if let Some(mut core) = cortex_m::Peripherals::take() {
+        core.DCB.enable_trace();
+        core.DWT.enable_cycle_counter();
+    }
+    kernels();
+    functions();
+    for (name, config) in
+        [("default", SlamConfig::default as fn() -> SlamConfig), ("paper", SlamConfig::paper)]
+    {
+        for known in KNOWN {
+            run(name, config(), known);
+        }
+    }
+    defmt::println!("end of benchmark");
+    loop {
+        cortex_m::asm::wfi();
+    }
+}
+
+/// The fixed set of scans through the core, with so many segments known.
+fn run(name: &str, config: SlamConfig, known: usize) {
+    static mut SLAM: MaybeUninit<Slam<CAPACITY>> = MaybeUninit::uninit();
+    // SAFETY: called from the only thread there is, and never from within itself.
+    let place = unsafe { &mut *(&raw mut SLAM) };
+    let Ok(slam) = Slam::new_in(place, config) else {
+        defmt::error!("the configuration {=str} cannot be used", name);
+        return;
+    };
+    let [x, y, heading] = BEGIN;
+    slam.take_up(&MAP[..known], pose(x, y, heading));
+    defmt::println!("run {=str} {=usize}", name, known);
+    for (ranges_mm, motion) in RANGES_MM.iter().zip(&MOTIONS) {
+        let motion = scan_motion(motion);
+        let mut cycles = [0u32; Stage::COUNT];
+        let mut current = Stage::Prediction;
+        let mut since = DWT::cycle_count();
+        let update = slam.process_scan_watched(&Scan { ranges_mm }, &motion, &mut |stage| {
+            let now = DWT::cycle_count();
+            cycles[current as usize] += now.wrapping_sub(since);
+            (current, since) = (stage, DWT::cycle_count());
+        });
+        cycles[current as usize] += DWT::cycle_count().wrapping_sub(since);
+        let points = update.deskew.points;
+        let keyframe = update.registration.keyframe;
+        let segments = slam.map().segments().len();
+        defmt::println!("scan {} {=u32} {=bool} {=usize}", cycles, points, keyframe, segments);
+    }
+}
+
+fn scan_motion(
+    (distance_m, turn_rad, moved, sweep): &(f32, f32, [f32; 3], [[f32; 3]; SWEEP_KNOTS]),
+) -> ScanMotion {
+    let at = |[x, y, heading]: [f32; 3]| pose(x, y, heading);
+    ScanMotion {
+        since_previous: Increment {
+            before_from_after: at(*moved),
+            distance_m: *distance_m,
+            turn_rad: *turn_rad,
+        },
+        middle_from_knot: sweep.map(at),
+    }
+}
+
+/// Cycles of a piece of work, less what reading the counter costs.
+fn count(work: impl FnOnce()) -> u32 {
+    let start = DWT::cycle_count();
+    let empty = DWT::cycle_count().wrapping_sub(start);
+    let start = DWT::cycle_count();
+    work();
+    DWT::cycle_count().wrapping_sub(start).wrapping_sub(empty)
+}
+
+/// Loops whose instructions were counted by hand.
+fn kernels() {
+    const TURNS: u32 = 1000;
+    let adds = count(|| {
+        // SAFETY: changes only its own registers and the flags.
+        unsafe {
+            core::arch::asm!(
+                "2:", "vadd.f32 s0, s0, s1", "vadd.f32 s2, s2, s1", "subs {n}, #1", "bne 2b",
+                n = inout(reg) TURNS => _, out("s0") _, out("s1") _, out("s2") _,
+            );
+        }
+    });
+    let divisions = count(|| {
+        // SAFETY: as above.
+        unsafe {
+            core::arch::asm!(
+                "2:", "vdiv.f32 s0, s1, s1", "subs {n}, #1", "bne 2b",
+                n = inout(reg) TURNS => _, out("s0") _, out("s1") _,
+            );
+        }
+    });
+    let words = [0.0f32; 4];
+    let loads = count(|| {
+        // SAFETY: reads four words that are there.
+        unsafe {
+            core::arch::asm!(
+                "2:", "vldr s0, [{p}]", "vldr s1, [{p}, #4]", "vldr s2, [{p}, #8]", "vldr s3, [{p}, #12]",
+                "subs {n}, #1", "bne 2b",
+                p = in(reg) words.as_ptr(), n = inout(reg) TURNS => _,
+                out("s0") _, out("s1") _, out("s2") _, out("s3") _,
+            );
+        }
+    });
+    defmt::println!("kernel adds {=u32} {=u32}", TURNS, adds);
+    defmt::println!("kernel divisions {=u32} {=u32}", TURNS, divisions);
+    defmt::println!("kernel loads {=u32} {=u32}", TURNS, loads);
+}
+
+/// Each function of libm that the core uses, beside micromath's.
+fn functions() {
+    use micromath::F32Ext;
+    let angle = |k: u32| -3.1 + 0.097 * k as f32;
+    function("sin", |k| libm::sinf(angle(k)), |k| F32Ext::sin(angle(k)));
+    function("cos", |k| libm::cosf(angle(k)), |k| F32Ext::cos(angle(k)));
+    function("atan2", |k| libm::atan2f(angle(k), angle(k + 7)), |k| F32Ext::atan2(angle(k), angle(k + 7)));
+    function("sqrt", |k| libm::sqrtf(k as f32), |k| F32Ext::sqrt(k as f32));
+}
+
+fn function(name: &str, libm: impl Fn(u32) -> f32, micromath: impl Fn(u32) -> f32) {
+    let cycles = |f: &dyn Fn(u32) -> f32| {
+        count(|| {
+            for k in 0..CALLS {
+                black_box(f(black_box(k)));
+            }
+        })
+    };
+    let around = cycles(&|k| k as f32);
+    let each = |f: &dyn Fn(u32) -> f32| cycles(f).saturating_sub(around) / CALLS;
+    defmt::println!("function {=str} {=u32} {=u32}", name, each(&libm), each(&micromath));
+}

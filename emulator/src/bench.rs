@@ -1,0 +1,227 @@
+//! The benchmark firmware's run, and what it counted.
+
+use std::path::Path;
+
+use anyhow::{Context, bail, ensure};
+use comfy_table::{Table, presets};
+use rigless::emulator::{self, Driver, Host, Start, Stop};
+use rigless::image::Image;
+use rigless::session::Session;
+use rigless::time::VirtualNanos;
+use slam_core::slam::Stage;
+
+use crate::board::Nucleo;
+use crate::firmware::{Log, LogLine, Symbols};
+
+/// The clock of the part after a reset. At as many instructions a second, the cycle counter counts instructions.
+const RESET_HZ: u64 = 16_000_000;
+/// The log is read this often, microseconds of virtual time.
+const GRID_US: u64 = 1000;
+/// A firmware that has not ended by then never will, microseconds of virtual time.
+const LONGEST_US: u64 = 3_600_000_000;
+
+/// Instructions that the default configuration may take for a scan, with 200 segments: median and 99th percentile.
+const BUDGET: [u32; 2] = [250_000, 500_000];
+const BUDGET_SEGMENTS: usize = 200;
+
+/// All that was counted.
+#[derive(Debug, Default)]
+pub struct Measured {
+    /// Loops counted by hand: name, turns, instructions.
+    pub kernels: Vec<(String, u32, u32)>,
+    /// Functions: name, instructions of libm's and of micromath's.
+    pub functions: Vec<(String, u32, u32)>,
+    /// Runs over the set of scans.
+    pub runs: Vec<Run>,
+}
+
+/// The set of scans with one configuration and map.
+#[derive(Debug)]
+pub struct Run {
+    /// Of the configuration.
+    pub name: String,
+    /// Segments of the map at the start.
+    pub known: usize,
+    /// Scan by scan.
+    pub scans: Vec<Counted>,
+}
+
+/// One scan.
+#[derive(Clone, Copy, Debug)]
+pub struct Counted {
+    /// Instructions of each stage.
+    pub stages: [u32; Stage::COUNT],
+    /// Points of the scan.
+    pub points: u32,
+    /// Whether the joint estimate took it in.
+    pub keyframe: bool,
+    /// Segments of the map afterwards.
+    pub segments: usize,
+}
+
+impl Counted {
+    /// Instructions of all stages.
+    pub fn total(&self) -> u32 {
+        self.stages.iter().sum()
+    }
+}
+
+/// Runs the firmware to its end.
+pub fn run(path: &Path, show: bool) -> anyhow::Result<Measured> {
+    let elf = std::fs::read(path).with_context(|| path.display().to_string())?;
+    let rtt = Symbols::rtt(&elf, path)?;
+    let board = Nucleo::bare(RESET_HZ)?;
+    let session = Session::new(Box::new(board), 0, VirtualNanos(GRID_US * 1000))?;
+    let reader = Reader { log: Log::new(&elf, path, rtt)?, lines: Vec::new(), show, failure: None };
+    let images = [Image::new(path, elf, None)?];
+    let mut finished = emulator::run(session, &Start::new(&images), reader)?;
+    if let Some(error) = finished.driver.failure.take() {
+        return Err(error);
+    }
+    if let Some(error) = finished.session.take_error() {
+        return Err(error.into());
+    }
+    let mut measured = Measured::default();
+    for line in &finished.driver.lines {
+        measured.take(&line.text).with_context(|| format!("the firmware says: {}", line.text))?;
+    }
+    Ok(measured)
+}
+
+/// Reads the log until the benchmark's end.
+struct Reader {
+    log: Log,
+    lines: Vec<LogLine>,
+    show: bool,
+    failure: Option<anyhow::Error>,
+}
+
+impl Driver<Nucleo> for Reader {
+    fn on_stop(&mut self, _: &mut Session<Nucleo>, stop: Stop, host: &mut dyn Host) -> Option<VirtualNanos> {
+        let before = self.lines.len();
+        if let Err(error) = self.log.drain(host, &mut self.lines) {
+            self.failure = Some(error);
+            return None;
+        }
+        for line in self.lines.iter().skip(before).filter(|_| self.show) {
+            println!("{line}");
+        }
+        if self.lines.last().is_some_and(|l| l.text == "end of benchmark") {
+            return None;
+        }
+        if stop.at.0 / 1000 > LONGEST_US {
+            self.failure = Some(anyhow::anyhow!("the firmware does not come to an end"));
+            return None;
+        }
+        Some(VirtualNanos(stop.at.0 + GRID_US * 1000))
+    }
+}
+
+impl Measured {
+    fn take(&mut self, text: &str) -> anyhow::Result<()> {
+        let (what, rest) = text.split_once(' ').context("a line of one word")?;
+        match what {
+            "kernel" | "function" => {
+                let words: Vec<&str> = rest.split(' ').collect();
+                let [name, a, b] = words[..] else { bail!("three words are expected") };
+                let list = if what == "kernel" { &mut self.kernels } else { &mut self.functions };
+                list.push((name.to_owned(), a.parse()?, b.parse()?));
+            }
+            "run" => {
+                let (name, known) = rest.split_once(' ').context("two words are expected")?;
+                self.runs.push(Run { name: name.to_owned(), known: known.parse()?, scans: Vec::new() });
+            }
+            "scan" => {
+                let (stages, rest) =
+                    rest.strip_prefix('[').and_then(|r| r.split_once("] ")).context("no list of stages")?;
+                let counts: Vec<u32> = stages.split(", ").map(str::parse).collect::<Result<_, _>>()?;
+                let words: Vec<&str> = rest.split(' ').collect();
+                let [points, keyframe, segments] = words[..] else { bail!("three words are expected") };
+                let scan = Counted {
+                    stages: counts.try_into().ok().context("another number of stages")?,
+                    points: points.parse()?,
+                    keyframe: keyframe.parse()?,
+                    segments: segments.parse()?,
+                };
+                self.runs.last_mut().context("a scan before its run")?.scans.push(scan);
+            }
+            "end" => {}
+            _ => bail!("this is no line of the benchmark"),
+        }
+        Ok(())
+    }
+
+    /// Prints all of it, and fails over the budget.
+    pub fn print(&self) -> anyhow::Result<()> {
+        println!(
+            "instructions for each scan of {} scans, median / p99 / max",
+            self.runs.first().map_or(0, |r| r.scans.len())
+        );
+        let mut table = Table::new();
+        table.load_style(presets::NOTHING);
+        let stages = Stage::ALL.map(|s| format!("{s:?}").to_lowercase());
+        table.set_header(
+            ["configuration", "segments"].map(String::from).into_iter().chain(stages).chain(["all".into()]),
+        );
+        for run in &self.runs {
+            let stage = |i: usize| cell(run.percentiles(|s| s.stages[i]));
+            let row = [run.name.clone(), run.known.to_string()]
+                .into_iter()
+                .chain((0..Stage::COUNT).map(stage))
+                .chain([cell(run.percentiles(Counted::total))]);
+            table.add_row(row);
+        }
+        println!("{table}");
+        for run in &self.runs {
+            let n = run.scans.len() as f64;
+            let points = run.scans.iter().map(|s| f64::from(s.points)).sum::<f64>() / n;
+            let of = |keyframe: bool| {
+                let mut all: Vec<u32> =
+                    run.scans.iter().filter(|s| s.keyframe == keyframe).map(Counted::total).collect();
+                all.sort_unstable();
+                all.get(all.len() / 2).copied().unwrap_or(0)
+            };
+            println!(
+                "{} {}: {points:.0} points a scan; {} keyframes, median {}, of the others {}; {} segments at the end",
+                run.name,
+                run.known,
+                run.scans.iter().filter(|s| s.keyframe).count(),
+                of(true),
+                of(false),
+                run.scans.last().map_or(0, |s| s.segments)
+            );
+        }
+        println!("\nfunction: instructions of libm, of micromath");
+        for (name, libm, micromath) in &self.functions {
+            println!("{name:<8} {libm:>6} {micromath:>6}");
+        }
+        println!("\nloops counted by hand: turns, instructions");
+        for (name, turns, instructions) in &self.kernels {
+            println!("{name:<10} {turns} {instructions}");
+        }
+        let run = self.runs.iter().find(|r| r.name == "default" && r.known == BUDGET_SEGMENTS);
+        let [median, p99, _] =
+            run.context("the run that has a budget is missing")?.percentiles(Counted::total);
+        ensure!(
+            median <= BUDGET[0] && p99 <= BUDGET[1],
+            "a scan takes {median} instructions at the median and {p99} at the 99th percentile; {} and {} are allowed",
+            BUDGET[0],
+            BUDGET[1]
+        );
+        Ok(())
+    }
+}
+
+impl Run {
+    /// Median, 99th percentile and maximum.
+    pub fn percentiles(&self, of: impl Fn(&Counted) -> u32) -> [u32; 3] {
+        let mut all: Vec<u32> = self.scans.iter().map(of).collect();
+        all.sort_unstable();
+        let at = |share: f64| all.get(((all.len() as f64 * share) as usize).min(all.len().saturating_sub(1)));
+        [0.5, 0.99, 1.0].map(|share| at(share).copied().unwrap_or(0))
+    }
+}
+
+fn cell([median, p99, max]: [u32; 3]) -> String {
+    format!("{median} / {p99} / {max}")
+}
