@@ -6,11 +6,13 @@
 //! The paper (section 2.2) takes the nearest along the perpendicular bisector. The default gates on side, direction,
 //! distance and overlap and takes the likeliest, with the covariance of pose and lines allowed for.
 
-use heapless::VecView;
-use nalgebra::{Isometry2, Matrix3};
+use heapless::{Vec, VecView};
+use nalgebra::{Isometry2, Matrix3, Point2, Vector2};
 
+use crate::extraction::MAX_SEGMENTS;
 use crate::map::MapSegment;
 use crate::math::sqrt;
+use crate::nearby::Nearby;
 use crate::pose::cross;
 use crate::residual::{LineNoise, Residual};
 use crate::segment::Segment;
@@ -72,38 +74,139 @@ pub struct View<'a> {
     pub line_noise: &'a LineNoise,
 }
 
-/// Finds the pairs. `candidates` are the indices of the map segments worth looking at.
+/// Pairs near enough to be looked at again while the pose is being corrected.
+#[derive(Clone, Debug, Default)]
+pub struct Shortlist {
+    pairs: Vec<(u8, u16), SHORTLISTED>,
+    /// The pose they were found through.
+    at: Option<Isometry2<f32>>,
+    /// Observed segments whose map segments all found room.
+    complete: usize,
+}
+
+/// Most pairs of a shortlist: four for each observed segment, 1 KiB.
+const SHORTLISTED: usize = 4 * MAX_SEGMENTS;
+/// A shortlist serves within this distance of the pose it was made for, metres, …
+const SERVES_M: f32 = 0.15;
+/// … and this angle, radians. It holds what is within the gates widened by both.
+const SERVES_RAD: f32 = 0.05;
+/// What a turn of the pose moves an observed segment by, metres for each radian: the farthest that is seen.
+const LEVER_M: f32 = 6.0;
+
+impl Shortlist {
+    /// Nothing; to be called before each scan.
+    pub fn clear(&mut self) {
+        self.at = None;
+    }
+
+    fn serves(&self, pose: &Isometry2<f32>) -> bool {
+        self.at.as_ref().is_some_and(|at| {
+            let moved = pose.translation.vector - at.translation.vector;
+            // Sine of the angle between both.
+            let turned = at.rotation.re * pose.rotation.im - at.rotation.im * pose.rotation.re;
+            moved.norm_squared() <= SERVES_M * SERVES_M
+                && turned.abs() <= SERVES_RAD
+                && at.rotation.re * pose.rotation.re + at.rotation.im * pose.rotation.im > 0.0
+        })
+    }
+
+    fn gather<const N: usize>(
+        &mut self,
+        observed: &[Segment],
+        pose: &Isometry2<f32>,
+        map: &[MapSegment],
+        nearby: &Nearby<N>,
+        config: &GateConfig,
+    ) {
+        let wide = GateConfig {
+            max_angle_rad: config.max_angle_rad + SERVES_RAD,
+            max_distance_m: config.max_distance_m + SERVES_M + SERVES_RAD * LEVER_M,
+            ..*config
+        };
+        self.pairs.clear();
+        (self.at, self.complete) = (Some(*pose), 0);
+        for (index, in_base) in observed.iter().enumerate() {
+            let direction = pose.rotation * in_base.direction;
+            let centroid = pose * in_base.moments.centroid;
+            for mapped in nearby.along(direction, wide.max_angle_rad) {
+                let Some(entry) = map.get(usize::from(mapped)) else { continue };
+                if may_be(&direction, &centroid, &entry.segment, &wide)
+                    && self.pairs.push((index as u8, mapped)).is_err()
+                {
+                    return;
+                }
+            }
+            self.complete = index + 1;
+        }
+    }
+}
+
+/// Finds the pairs among the map segments `nearby`. The shortlist saves looking at all of them again from a pose close to the last.
 ///
-/// Work: one step for each observed segment and candidate.
-pub fn associate(
+/// Work: one step for each observed segment and each map segment nearby that runs like it.
+pub fn associate<const N: usize>(
     observed: &[Segment],
     view: &View<'_>,
     map: &[MapSegment],
-    candidates: &[u16],
+    nearby: &Nearby<N>,
     config: &AssociationConfig,
+    shortlist: &mut Shortlist,
     pairs: &mut VecView<Pair>,
 ) {
     pairs.clear();
-    for (index, in_base) in observed.iter().enumerate() {
-        let in_map = in_base.transformed(view.pose);
-        let mut best: Option<(f32, usize)> = None;
-        for &candidate in candidates {
-            let mapped = usize::from(candidate);
-            let Some(entry) = map.get(mapped) else { continue };
-            let score = match config {
-                AssociationConfig::Bisector(config) => bisector_distance(&in_map, &entry.segment, config),
-                AssociationConfig::Gated(config) => gated_chi2(&in_map, &entry.segment, view, config),
-            };
-            if let Some(score) = score
-                && best.is_none_or(|(least, _)| score < least)
-            {
-                best = Some((score, mapped));
+    let config = match config {
+        AssociationConfig::Bisector(config) => {
+            for (index, in_base) in observed.iter().enumerate() {
+                let in_map = in_base.transformed(view.pose);
+                let score = |mapped: &Segment| bisector_distance(&in_map, mapped, config);
+                pair_with_best(index, nearby.all().iter().copied(), map, score, pairs);
             }
+            return;
         }
-        if let Some((_, mapped)) = best {
-            // One pair for each observed segment: the caller's capacities are the same.
-            let _ = pairs.push(Pair { observed: index, mapped });
+        AssociationConfig::Gated(config) => config,
+    };
+    if !shortlist.serves(view.pose) {
+        shortlist.gather(observed, view.pose, map, nearby, config);
+    }
+    let mut rest = shortlist.pairs.as_slice();
+    for (index, in_base) in observed.iter().enumerate() {
+        let count = rest.iter().take_while(|(observed, _)| usize::from(*observed) == index).count();
+        let (own, others) = rest.split_at(count.min(rest.len()));
+        rest = others;
+        let is_complete = index < shortlist.complete;
+        if is_complete && own.is_empty() {
+            continue;
         }
+        let in_map = in_base.transformed(view.pose);
+        let score = |mapped: &Segment| gated_chi2(&in_map, mapped, view, config);
+        if is_complete {
+            pair_with_best(index, own.iter().map(|(_, mapped)| *mapped), map, score, pairs);
+        } else {
+            let like_it = nearby.along(in_map.direction, config.max_angle_rad);
+            pair_with_best(index, like_it, map, score, pairs);
+        }
+    }
+}
+
+/// Adds the pair of an observed segment and the map segment of the least score, if any has one.
+fn pair_with_best(
+    observed: usize,
+    candidates: impl Iterator<Item = u16>,
+    map: &[MapSegment],
+    score: impl Fn(&Segment) -> Option<f32>,
+    pairs: &mut VecView<Pair>,
+) {
+    let mut best: Option<(f32, usize)> = None;
+    for mapped in candidates.map(usize::from) {
+        if let Some(score) = map.get(mapped).and_then(|entry| score(&entry.segment))
+            && best.is_none_or(|(least, _)| score < least)
+        {
+            best = Some((score, mapped));
+        }
+    }
+    if let Some((_, mapped)) = best {
+        // One pair for each observed segment: the caller's capacities are the same.
+        let _ = pairs.push(Pair { observed, mapped });
     }
 }
 
@@ -120,15 +223,16 @@ fn bisector_distance(observed: &Segment, mapped: &Segment, config: &BisectorConf
     ((0.0..=1.0).contains(&t) && s.abs() <= config.max_distance_m).then_some(s.abs())
 }
 
+/// Whether a segment with this direction and centroid passes the gates on direction and distance.
+fn may_be(direction: &Vector2<f32>, centroid: &Point2<f32>, mapped: &Segment, config: &GateConfig) -> bool {
+    direction.dot(&mapped.direction) > 0.0
+        && cross(mapped.direction, *direction).abs() <= config.max_angle_rad
+        && mapped.normal().dot(&(centroid - mapped.moments.centroid)).abs() <= config.max_distance_m
+}
+
 /// χ² of the pair if it passes every gate.
 fn gated_chi2(observed: &Segment, mapped: &Segment, view: &View<'_>, config: &GateConfig) -> Option<f32> {
-    let cos_angle = observed.direction.dot(&mapped.direction);
-    let sin_angle = cross(mapped.direction, observed.direction);
-    if cos_angle <= 0.0 || sin_angle.abs() > config.max_angle_rad {
-        return None;
-    }
-    let offset = mapped.normal().dot(&(observed.moments.centroid - mapped.moments.centroid));
-    if offset.abs() > config.max_distance_m {
+    if !may_be(&observed.direction, &observed.moments.centroid, mapped, config) {
         return None;
     }
     // How far the pose may be off along this wall.
@@ -149,8 +253,7 @@ fn gated_chi2(observed: &Segment, mapped: &Segment, view: &View<'_>, config: &Ga
 mod tests {
     use super::*;
     use crate::pose::pose;
-    use heapless::Vec;
-    use nalgebra::Point2;
+    use proptest::prelude::*;
 
     const NOISE: LineNoise = LineNoise { sigma_offset_m: 0.005, sigma_direction_rad: 0.002 };
 
@@ -167,12 +270,13 @@ mod tests {
             .iter()
             .map(|&segment| MapSegment { segment, hits: 3, seen_through: 0, last_seen: 0, seen_at_m: 0.0 })
             .collect();
-        let candidates: std::vec::Vec<u16> = (0..map.len() as u16).collect();
+        let mut nearby = Nearby::<4>::new();
+        nearby.gather(&map, &Isometry2::identity(), f32::INFINITY, |_| true);
         let covariance =
             Matrix3::from_diagonal(&nalgebra::Vector3::new(sigma_m.powi(2), sigma_m.powi(2), 1e-4));
         let view = View { pose: &pose(0.0, 0.0, 0.0), covariance: &covariance, line_noise: &NOISE };
         let mut pairs: Vec<Pair, 4> = Vec::new();
-        associate(&[*observed], &view, &map, &candidates, config, &mut pairs);
+        associate(&[*observed], &view, &map, &nearby, config, &mut Shortlist::default(), &mut pairs);
         pairs.first().map(|p| p.mapped)
     }
 
@@ -232,5 +336,31 @@ mod tests {
         let map = [wall((0.0, 1.08), (2.0, 1.08)), wall((0.0, 0.97), (2.0, 0.97))];
         assert_eq!(pair(&seen, &map, &gated(), 0.1), Some(1));
         assert_eq!(pair(&seen, &[], &gated(), 0.1), None);
+    }
+
+    proptest! {
+        /// Corrected by steps of any size, through one shortlist, the pairs are those found afresh.
+        #[test]
+        fn the_shortlist_changes_nothing(
+            walls in proptest::collection::vec((-4.0f32..4.0, -4.0f32..4.0, -4.0f32..4.0, -4.0f32..4.0), 1..40),
+            steps in proptest::collection::vec((-0.2f32..0.2, -0.2f32..0.2, -0.08f32..0.08), 1..6),
+        ) {
+            let walls: std::vec::Vec<Segment> = walls.iter().map(|&(a, b, c, d)| wall((a, b), (c, d))).collect();
+            let entry = |&segment: &Segment| MapSegment { segment, hits: 3, seen_through: 0, last_seen: 0, seen_at_m: 0.0 };
+            let map: std::vec::Vec<MapSegment> = walls.iter().map(entry).collect();
+            let mut nearby = Nearby::<64>::new();
+            nearby.gather(&map, &Isometry2::identity(), 10.0, |_| true);
+            let covariance = Matrix3::from_diagonal(&nalgebra::Vector3::new(0.01, 0.01, 0.01));
+            let mut shortlist = Shortlist::default();
+            let mut at = nalgebra::Vector3::zeros();
+            for (x, y, turn) in steps {
+                at += nalgebra::Vector3::new(x, y, turn);
+                let view = View { pose: &pose(at.x, at.y, at.z), covariance: &covariance, line_noise: &NOISE };
+                let (mut kept, mut fresh) = (Vec::<Pair, 64>::new(), Vec::<Pair, 64>::new());
+                associate(&walls, &view, &map, &nearby, &gated(), &mut shortlist, &mut kept);
+                associate(&walls, &view, &map, &nearby, &gated(), &mut Shortlist::default(), &mut fresh);
+                prop_assert_eq!(kept, fresh);
+            }
+        }
     }
 }

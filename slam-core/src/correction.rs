@@ -70,8 +70,8 @@ const SINGULAR_SHARE: f32 = 1e-3;
 /// Which directions of the pose the pairs fix.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observability {
-    /// Eigenvalues of the pairs' normal matrix over (x, y, θ·1 m), ascending, 1/m². The prior is not in it.
-    pub eigenvalues: [f32; 3],
+    /// Normal matrix of the pairs over (x, y, θ·1 m), 1/m². The prior is not in it.
+    pub information: Matrix3<f32>,
     /// Unit direction in `map` along which translation is seen worst.
     pub weak_direction: Vector2<f32>,
     /// Standard deviation along that direction from the pairs alone, metres; infinite when they say nothing.
@@ -97,12 +97,17 @@ pub enum Verdict {
 impl Observability {
     /// Nothing seen.
     pub const BLIND: Self = Self {
-        eigenvalues: [0.0; 3],
+        information: Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         weak_direction: Vector2::new(1.0, 0.0),
         weak_sigma_m: f32::INFINITY,
         trusted_share: 0.0,
         verdict: Verdict::Blind,
     };
+
+    /// Eigenvalues of the normal matrix, ascending, 1/m²: how much is known of each direction of the pose.
+    pub fn eigenvalues(&self) -> [f32; 3] {
+        sorted_eigenvalues(&self.information)
+    }
 
     /// The matrix T that turns a derivative J by the position into J·T, so that the weak direction keeps its trusted
     /// information only.
@@ -243,9 +248,8 @@ fn translation_information(information: &Matrix3<f32>) -> Matrix2<f32> {
 
 /// What a normal matrix says of each direction; see [`MapConfig`] for the two limits.
 fn judge(information: &Matrix3<f32>, direction_trust_rad: f32, observable_sigma_m: f32) -> Observability {
-    let eigenvalues = sorted_eigenvalues(information);
-    let [_, _, most] = eigenvalues;
-    if most.is_nan() || most <= 0.0 {
+    let trace = information.trace();
+    if !(trace > 0.0 && trace.is_finite()) {
         return Observability::BLIND;
     }
     let [(strong, _), (weak, weak_direction)] = eigen2(&translation_information(information));
@@ -253,7 +257,7 @@ fn judge(information: &Matrix3<f32>, direction_trust_rad: f32, observable_sigma_
     let trusted_share = if weak > 0.0 { usable / weak } else { 0.0 };
     let weak_sigma_m = if usable > 0.0 { 1.0 / sqrt(usable) } else { f32::INFINITY };
     let verdict = if weak_sigma_m <= observable_sigma_m { Verdict::Full } else { Verdict::Corridor };
-    Observability { eigenvalues, weak_direction, weak_sigma_m, trusted_share, verdict }
+    Observability { information: *information, weak_direction, weak_sigma_m, trusted_share, verdict }
 }
 
 /// What remains of the weak direction's information when that which uncertain line directions explain is taken out.
@@ -275,9 +279,10 @@ fn sorted_eigenvalues(m: &Matrix3<f32>) -> [f32; 3] {
         return [0.0; 3];
     }
     let values = nalgebra::SymmetricEigen::try_new(*m, f32::EPSILON, 50).map(|e| e.eigenvalues);
-    let mut sorted = values.map_or([0.0; 3], |v| [v.x, v.y, v.z]);
-    sorted.sort_unstable_by(f32::total_cmp);
-    sorted
+    let [a, b, c] = values.map_or([0.0; 3], |v| [v.x, v.y, v.z]);
+    let (a, b) = (a.min(b), a.max(b));
+    let (b, c) = (b.min(c), b.max(c));
+    [a.min(b), a.max(b), c]
 }
 
 fn largest(step: &Vector3<f32>) -> f32 {

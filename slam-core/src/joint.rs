@@ -22,6 +22,7 @@ use crate::segment::Segment;
 
 /// Most map segments whose errors are tracked together: 48.
 pub const LINES: usize = 48;
+const _: () = assert!(LINES <= u64::BITS as usize, "a bit for each");
 /// Pose, then the odometry's errors, then the lines.
 const POSE: usize = 0;
 const ODOMETRY: usize = 3;
@@ -31,6 +32,11 @@ const PACKED: usize = STATES * (STATES + 1) / 2;
 /// Largest variances of the pose's position (m²) and heading (rad²). Beyond them `f32` could not tell the lines around the
 /// robot from each other any more; a robot so unsure begins anew with what it sees.
 const MOST_VARIANCE: [f32; 3] = [25.0, 25.0, 0.25];
+/// A line that has turned by less has its errors where they were, radians: with a robot that knows its position to a
+/// decimetre that is wrong by a tenth of a millimetre.
+const CARRIED_RAD: f32 = 1e-3;
+/// A centroid stays where it is while the offset's variance there is larger by less than this share.
+const CENTRED_SHARE: f32 = 0.01;
 /// Least variance of a state: beneath it `f32` has no digits left.
 const LEAST_VARIANCE: f32 = 1e-12;
 
@@ -48,6 +54,10 @@ pub struct Joint {
     bias: OdometryBias,
     /// Scans since each line was added; infinite for one that was known before.
     ages_scans: [f32; LINES],
+    /// Places that hold lines of the scan at hand, a bit for each.
+    in_use: u64,
+    /// Turn of each line, radians, that has not been carried over to the covariance yet.
+    turned: [f32; LINES],
     /// What the measurements since the last [`Joint::settle`] have moved each state by.
     shift: [f32; STATES],
 }
@@ -83,6 +93,8 @@ impl Joint {
             owners: [None; LINES],
             bias: OdometryBias::default(),
             ages_scans: [f32::INFINITY; LINES],
+            in_use: 0,
+            turned: [0.0; LINES],
             shift: [0.0; STATES],
         }
     }
@@ -100,6 +112,8 @@ impl Joint {
         self.covariance.fill(0.0);
         self.owners.fill(None);
         self.ages_scans.fill(f32::INFINITY);
+        self.in_use = 0;
+        self.turned.fill(0.0);
         self.shift.fill(0.0);
         if !self.bias.0.iter().all(|v| v.is_finite()) {
             self.bias = OdometryBias::default();
@@ -163,6 +177,7 @@ impl Joint {
         map: &mut SegmentMap<N>,
     ) {
         self.ages_scans.iter_mut().for_each(|age| *age += 1.0);
+        self.in_use = 0;
         let cross = Matrix3::from_fn(|i, j| self.get(POSE + i, ODOMETRY + j));
         let (pose, errors) = (self.block(POSE), self.block(ODOMETRY));
         let mixed = by_pose * cross * by_odometry.transpose();
@@ -227,17 +242,13 @@ impl Joint {
 
     /// The place of a map segment among the lines; it is given one if it has none, at the cost of the segment not seen
     /// for longest. `None` when all lines tracked were seen in the scan at hand.
-    pub(crate) fn track<const N: usize>(
-        &mut self,
-        index: usize,
-        map: &mut SegmentMap<N>,
-        scan: u32,
-    ) -> Option<usize> {
+    pub(crate) fn track<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) -> Option<usize> {
         if let Some(place) = self.place_of(index) {
+            self.in_use |= 1 << place;
             return Some(place);
         }
         let segment = map.segments().get(index)?.segment;
-        let place = self.free_place(map, scan)?;
+        let place = self.free_place(map)?;
         *self.owners.get_mut(place)? = u16::try_from(index).ok();
         *self.ages_scans.get_mut(place)? = f32::INFINITY;
         for (state, variance) in states_of(place).into_iter().zip(variances(&segment)) {
@@ -246,15 +257,17 @@ impl Joint {
         Some(place)
     }
 
-    /// A place without covariances.
-    fn free_place<const N: usize>(&mut self, map: &mut SegmentMap<N>, scan: u32) -> Option<usize> {
+    /// A place without covariances, for use in the scan at hand.
+    fn free_place<const N: usize>(&mut self, map: &mut SegmentMap<N>) -> Option<usize> {
         let last_seen = |owner: &Option<u16>| match owner {
             Some(owner) => map.segments().get(usize::from(*owner)).map_or(0, |s| 1 + s.last_seen),
             None => 0,
         };
-        let longest_ago = self.owners.iter().map(last_seen).enumerate().min_by_key(|(_, seen)| *seen);
-        let (place, _) = longest_ago.filter(|(_, seen)| *seen <= scan)?;
+        let owners = self.owners.iter().enumerate().filter(|(place, _)| self.in_use & (1 << place) == 0);
+        let (place, _) =
+            owners.map(|(place, owner)| (place, last_seen(owner))).min_by_key(|(_, seen)| *seen)?;
         self.release(place, map);
+        self.in_use |= 1 << place;
         Some(place)
     }
 
@@ -271,6 +284,10 @@ impl Joint {
             self.set(state, offset, 0.0);
             self.set(state, direction, 0.0);
         }
+        if let Some(turned) = self.turned.get_mut(place) {
+            *turned = 0.0;
+        }
+        self.in_use &= !(1 << place);
     }
 
     /// The map's segment `gone` is no more, and the one at `last` has taken its index.
@@ -286,69 +303,111 @@ impl Joint {
         }
     }
 
-    /// χ² of a measurement: what is left of its error after what was measured before, against all that may explain it.
-    pub(crate) fn chi2(&self, measurement: &Measurement) -> f32 {
+    /// What a measurement would say now, after what was measured before.
+    pub(crate) fn weigh(&self, measurement: &Measurement) -> Weighed {
         let [(error_o, row_o), (error_d, row_d)] = &measurement.rows;
         let error = Vector2::new(error_o + self.moved(row_o), error_d + self.moved(row_d));
         let [var_o, var_d] = measurement.variances;
+        let [known_o, known_d] = [row_o, row_d].map(|row| self.between(row, row));
         let both = self.between(row_o, row_d);
-        let covariance =
-            Matrix2::new(self.between(row_o, row_o) + var_o, both, both, self.between(row_d, row_d) + var_d);
-        covariance.try_inverse().map_or(f32::INFINITY, |w| error.dot(&(w * error)))
-    }
-
-    /// Takes in a measurement whose variances are this many times what it says. With `only`, the line at this place learns
-    /// from it and nothing else does.
-    pub(crate) fn measure(&mut self, measurement: &Measurement, variance_factor: f32, only: Option<usize>) {
-        let learning = only.map(states_of);
-        for ((error, row), variance) in measurement.rows.iter().zip(measurement.variances) {
-            self.measure_row(*error, row, variance * variance_factor, learning);
+        let covariance = Matrix2::new(known_o + var_o, both, both, known_d + var_d);
+        Weighed {
+            chi2: covariance.try_inverse().map_or(f32::INFINITY, |w| error.dot(&(w * error))),
+            gains: [known_o / var_o, known_d / var_d],
         }
     }
 
-    fn measure_row(&mut self, error: f32, row: &Row, variance: f32, learning: Option<[usize; 2]>) {
-        let states = self.states();
-        let mut with = [-0.0; STATES];
-        for &(other, by) in row {
-            self.add_row(other, by, with.get_mut(..states).unwrap_or_default());
+    /// Takes in those numbers of a measurement, offset and direction, that `taken` names; its variances are so many times what
+    /// it says. Work: with [`Learning::All`] the square of the number of states, otherwise that number, some times.
+    pub(crate) fn measure(
+        &mut self,
+        measurement: &Measurement,
+        variance_factor: f32,
+        taken: [bool; 2],
+        learning: Learning,
+    ) {
+        // What has been told but not yet taken off the covariance.
+        let mut told: Option<Innovation> = None;
+        let numbers = measurement.rows.iter().zip(measurement.variances).zip(taken);
+        for (((error, row), variance), _) in numbers.filter(|(_, taken)| *taken) {
+            let innovation = self.innovation(row, variance * variance_factor).and_then(|i| match &told {
+                Some(told) => i.after(told, row),
+                None => Some(i),
+            });
+            let Some(innovation) = innovation else { continue };
+            self.shift_by(&innovation, error + self.moved(row), learning);
+            match (told.take(), learning) {
+                // What only a line learns, the robot does not know when it is told the next.
+                (_, Learning::Line(_)) => self.lower([&innovation], learning),
+                (Some(told), _) => self.lower([&told, &innovation], learning),
+                (None, _) => told = Some(innovation),
+            }
         }
-        let total: f32 =
-            row.iter().map(|&(state, by)| by * with.get(state).copied().unwrap_or(0.0)).sum::<f32>()
-                + variance;
-        let left = error + self.moved(row);
-        if !(total > 0.0 && total.is_finite() && left.is_finite()) {
+        if let Some(told) = &told {
+            self.lower([told], learning);
+        }
+    }
+
+    /// What a row of a measurement says of all states; `None` where the numbers do not allow it.
+    fn innovation(&self, row: &Row, variance: f32) -> Option<Innovation> {
+        let mut with = [0.0; STATES];
+        let tracked = with.get_mut(..self.states())?;
+        for &(state, by) in row {
+            self.add_row(state, by, tracked);
+        }
+        Innovation { total: along(row, &with) + variance, with }.checked()
+    }
+
+    fn shift_by(&mut self, innovation: &Innovation, error: f32, learning: Learning) {
+        if !error.is_finite() {
             return;
         }
-        let learns = |state: usize| learning.is_none_or(|learning| learning.contains(&state));
-        for (state, (shift, value)) in self.shift.iter_mut().zip(&with).enumerate() {
-            if learns(state) {
-                *shift -= value / total * left;
+        let by = error / innovation.total;
+        for (state, (shift, with)) in self.shift.iter_mut().zip(&innovation.with).enumerate() {
+            if learning.includes(state) {
+                *shift -= with * by;
             }
         }
+    }
+
+    /// Takes from the covariance what innovations that are independent of each other have told. What does not learn has no
+    /// gain; the gains of the others are those of the whole filter.
+    fn lower<const K: usize>(&mut self, innovations: [&Innovation; K], learning: Learning) {
+        let states = self.states();
+        let with = innovations.map(|i| &i.with);
+        // The first so many states learn, and one line.
+        let (first, own) = match learning {
+            Learning::All => (STATES, [0; 2]),
+            Learning::RobotAndLine(place) => (FIRST_LINE, states_of(place)),
+            Learning::Line(place) => (0, states_of(place)),
+        };
         let mut rest = self.covariance.as_mut_slice();
-        for (state, value) in with.iter().enumerate().take(states) {
-            let Some((packed, below)) = rest.split_at_mut_checked(state + 1) else { return };
-            let gain = value / total;
-            match learning {
-                Some(learning) if !learning.contains(&state) => {
-                    for column in learning {
-                        if let (Some(covariance), Some(other)) = (packed.get_mut(column), with.get(column)) {
-                            *covariance -= gain * other;
-                        }
-                    }
-                }
-                _ => packed.iter_mut().zip(&with).for_each(|(covariance, other)| *covariance -= gain * other),
-            }
-            if let Some(own) = packed.last_mut() {
-                *own = own.max(if *value == 0.0 { 0.0 } else { LEAST_VARIANCE });
-            }
+        for state in 0..states {
+            let Some((row, below)) = rest.split_at_mut_checked(state + 1) else { return };
             rest = below;
+            let gains = innovations.map(|i| i.with.get(state).map_or(0.0, |with| with / i.total));
+            if gains == [0.0; K] {
+                continue;
+            }
+            if state < first || own.contains(&state) {
+                subtract(row, 0, with, gains);
+                if let Some(variance) = row.last_mut() {
+                    *variance = variance.max(LEAST_VARIANCE);
+                }
+                continue;
+            }
+            // What it has in common with those that do learn.
+            for (begin, count) in [(0, first), (own[0], own.len())] {
+                if let Some(part) = row.get_mut(begin..(begin + count).min(state)) {
+                    subtract(part, begin, with, gains);
+                }
+            }
         }
     }
 
     /// What the measurements so far have changed in a measurement's error.
     fn moved(&self, row: &Row) -> f32 {
-        row.iter().map(|&(state, by)| by * self.shift.get(state).copied().unwrap_or(0.0)).sum()
+        along(row, &self.shift)
     }
 
     fn between(&self, a: &Row, b: &Row) -> f32 {
@@ -378,9 +437,16 @@ impl Joint {
             let Some(entry) = map.get_mut(usize::from(owner)) else { continue };
             let [offset, direction] = states_of(place);
             let moved = entry.segment.shifted(part(offset), part(direction));
-            let turned = moved.normal() - entry.segment.normal();
-            let [by_pose, _] = pose_rows(turned, moved.moments.centroid.coords - settled.translation.vector);
-            self.add_states(offset, &by_pose);
+            if let Some(turned) = self.turned.get_mut(place) {
+                *turned += part(direction);
+                if turned.abs() > CARRIED_RAD {
+                    // The normal turns away from the direction.
+                    let normal_by = -moved.direction * core::mem::take(turned);
+                    let from_robot = moved.moments.centroid.coords - settled.translation.vector;
+                    let [by_pose, _] = pose_rows(normal_by, from_robot);
+                    self.add_states(offset, &by_pose);
+                }
+            }
             let moved = self.centred(&moved, place, pose_information.as_ref());
             if moved.is_finite() {
                 entry.segment = moved;
@@ -434,8 +500,10 @@ impl Joint {
             let way = -self.get(offset, direction) / var_direction;
             let (a, b) = (segment.along_of(segment.start), segment.along_of(segment.end));
             let way = if a <= b { within(way, a, b) } else { 0.0 };
-            self.add_states(offset, &[(direction, way)]);
-            segment.moments.centroid += segment.direction * way;
+            if way * way * var_direction > CENTRED_SHARE * self.get(offset, offset) {
+                self.add_states(offset, &[(direction, way)]);
+                segment.moments.centroid += segment.direction * way;
+            }
         }
         let [var_offset, var_direction] =
             [offset, direction].map(|state| self.given_pose(state, pose_information));
@@ -457,12 +525,11 @@ impl Joint {
         index: usize,
         position: Vector2<f32>,
         map: &mut SegmentMap<N>,
-        scan: u32,
     ) {
         let Some(segment) = map.segments().get(index).map(|s| s.segment) else { return };
         let [var_offset, var_direction] = variances(&segment);
         let by_pose = pose_rows(segment.normal(), segment.moments.centroid.coords - position);
-        let Some(place) = self.free_place(map, scan) else {
+        let Some(place) = self.free_place(map) else {
             let rows = [self.between(&by_pose[0], &by_pose[0]), self.between(&by_pose[1], &by_pose[1])];
             if let Some(entry) = map.get_mut(index) {
                 entry.segment = with_variances(&segment, var_offset + rows[0], var_direction + rows[1]);
@@ -486,6 +553,91 @@ impl Joint {
         self.set(offset, offset, self.between(row_o, row_o) + var_offset);
         self.set(direction, direction, self.between(row_d, row_d) + var_direction);
         self.set(offset, direction, self.between(row_o, row_d));
+    }
+}
+
+/// What a measurement would say.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Weighed {
+    /// Its error against all that may explain it.
+    pub chi2: f32,
+    /// Variance of what it measures over its own, for offset and direction: how much each would tell.
+    pub gains: [f32; 2],
+}
+
+/// What learns from a measurement. What does not keeps its estimate, and rightly knows less of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Learning {
+    /// Everything that has something in common with it.
+    All,
+    /// The pose, the odometry's errors and the line at this place.
+    RobotAndLine(usize),
+    /// The line at this place.
+    Line(usize),
+}
+
+impl Learning {
+    fn includes(self, state: usize) -> bool {
+        match self {
+            Self::All => true,
+            Self::RobotAndLine(place) => state < FIRST_LINE || states_of(place).contains(&state),
+            Self::Line(place) => states_of(place).contains(&state),
+        }
+    }
+}
+
+/// What one number measured says: the covariance of each state with what was measured, and the variance of that, the
+/// measurement's own included.
+struct Innovation {
+    with: [f32; STATES],
+    total: f32,
+}
+
+impl Innovation {
+    fn checked(self) -> Option<Self> {
+        (self.total > 0.0 && self.total.is_finite()).then_some(self)
+    }
+
+    /// What this says beyond what another has told; `row` is this one's.
+    fn after(mut self, other: &Self, row: &Row) -> Option<Self> {
+        let both = along(row, &other.with);
+        let share = both / other.total;
+        self.with.iter_mut().zip(&other.with).for_each(|(own, other)| *own -= share * other);
+        self.total -= share * both;
+        self.checked()
+    }
+}
+
+/// What a row measures of some values of all states.
+fn along(row: &Row, values: &[f32; STATES]) -> f32 {
+    row.iter().map(|&(state, by)| by * values.get(state).copied().unwrap_or(0.0)).sum()
+}
+
+/// Takes so many times each of some vectors, from an index on, from the values. The heart of the joint estimate: four at a time, so
+/// that the microcontroller need not count so often.
+#[inline]
+fn subtract<const K: usize>(from: &mut [f32], begin: usize, with: [&[f32; STATES]; K], times: [f32; K]) {
+    let with = with.map(|values| values.get(begin..begin + from.len()).unwrap_or_default().as_chunks::<4>());
+    let (fours, rest) = from.as_chunks_mut::<4>();
+    match (with.as_slice(), times.as_slice()) {
+        // Two at once: a value is loaded and stored but once.
+        (&[(a, _), (b, _)], &[times_a, times_b]) => {
+            for ((four, a), b) in fours.iter_mut().zip(a).zip(b) {
+                for ((value, a), b) in four.iter_mut().zip(a).zip(b) {
+                    *value = *value - times_a * a - times_b * b;
+                }
+            }
+        }
+        _ => {
+            for ((others, _), times) in with.iter().zip(times) {
+                for (four, others) in fours.iter_mut().zip(*others) {
+                    four.iter_mut().zip(others).for_each(|(value, other)| *value -= times * other);
+                }
+            }
+        }
+    }
+    for ((_, others), times) in with.iter().zip(times) {
+        rest.iter_mut().zip(*others).for_each(|(value, other)| *value -= times * other);
     }
 }
 
@@ -661,18 +813,18 @@ mod tests {
                     new.push((i, with_variances(&noisy, SEEN[0], SEEN[1])));
                     continue;
                 };
-                let place = self.joint.track(index, &mut self.map, self.scan).unwrap();
+                let place = self.joint.track(index, &mut self.map).unwrap();
                 let entry = self.map.get_mut(index).unwrap();
                 entry.last_seen = self.scan;
                 let position = self.believed.translation.vector;
                 let measurement =
                     Measurement::of_pair(place, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
-                self.joint.measure(&measurement, 1.0, None);
+                self.joint.measure(&measurement, 1.0, [true; 2], Learning::All);
             }
             self.believed = self.joint.settle(&self.believed, &mut self.map);
             for (i, in_base) in new {
                 let index = self.map.insert(in_base.transformed(&self.believed), self.scan, 0.0).unwrap();
-                self.joint.add(index, self.believed.translation.vector, &mut self.map, self.scan);
+                self.joint.add(index, self.believed.translation.vector, &mut self.map);
                 self.known[i] = Some(index);
             }
         }
@@ -736,12 +888,12 @@ mod tests {
         world.step(0.1, Vector3::zeros());
         let before = world.joint.clone();
         let entry = world.map.segments()[0];
-        let place = world.joint.track(0, &mut world.map, 2).unwrap();
+        let place = world.joint.track(0, &mut world.map).unwrap();
         let seen = entry.segment.shifted(0.05, 0.1);
         let position = world.believed.translation.vector;
         let measurement =
             Measurement::of_pair(place, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
-        world.joint.measure(&measurement, 1.0, Some(place));
+        world.joint.measure(&measurement, 1.0, [true; 2], Learning::Line(place));
         assert_eq!(world.joint.pose_covariance(), before.pose_covariance());
         let same = world.joint.settle(&world.believed, &mut world.map);
         assert_eq!(components(&same), components(&world.believed));

@@ -80,6 +80,7 @@ pub mod loop_closure;
 pub mod map;
 pub mod mapper;
 pub mod math;
+pub mod nearby;
 pub mod odometry;
 pub mod odometry_bias;
 pub mod odometry_track;

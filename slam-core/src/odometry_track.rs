@@ -94,26 +94,33 @@ impl<const K: usize> OdometryTrack<K> {
     ///
     /// `None` without samples. Work: at most `K` steps.
     pub fn pose_at(&self, stamp_us: u64) -> Option<Isometry2<f32>> {
-        let mut before: Option<&Knot> = None;
-        for knot in self.knots.oldest_ordered() {
-            if knot.stamp_us == stamp_us {
-                return Some(knot.odom_from_base);
+        self.poses_at([stamp_us]).map(|[pose]| pose)
+    }
+
+    /// The same at several instants, the earliest first. Work: at most `K` + `M` steps.
+    fn poses_at<const M: usize>(&self, stamps_us: [u64; M]) -> Option<[Isometry2<f32>; M]> {
+        let mut knots = self.knots.oldest_ordered();
+        let mut before = knots.next()?;
+        let mut after = knots.next();
+        Some(stamps_us.map(|stamp_us| {
+            while let Some(knot) = after.filter(|knot| knot.stamp_us <= stamp_us) {
+                (before, after) = (knot, knots.next());
             }
-            if knot.stamp_us > stamp_us {
-                return Some(before.map_or(knot.odom_from_base, |b| interpolate(b, knot, stamp_us)));
+            match after {
+                Some(after) if stamp_us > before.stamp_us => interpolate(before, after, stamp_us),
+                _ => before.odom_from_base,
             }
-            before = Some(knot);
-        }
-        before.map(|knot| knot.odom_from_base)
+        }))
     }
 
     /// The motion from one instant to a later one, with the way travelled on it. `None` without samples.
     pub fn between(&self, from_us: u64, to_us: u64) -> Option<Increment> {
-        let before_from_after = self.pose_at(from_us)?.inverse() * self.pose_at(to_us)?;
+        let [before, after] = self.poses_at([from_us, to_us])?;
+        let before_from_after = before.inverse() * after;
         let (mut distance_m, mut turn_rad) = (0.0, 0.0);
         let mut previous: Option<&Knot> = None;
         for knot in self.knots.oldest_ordered() {
-            if let Some(p) = previous {
+            if let Some(p) = previous.filter(|p| p.stamp_us < to_us && knot.stamp_us > from_us) {
                 let overlap = knot.stamp_us.min(to_us).saturating_sub(p.stamp_us.max(from_us));
                 let share = overlap as f32 / (knot.stamp_us - p.stamp_us) as f32;
                 distance_m += share * knot.step.distance_m;
@@ -127,7 +134,7 @@ impl<const K: usize> OdometryTrack<K> {
     /// The motion for a scan whose middle beam was taken at `middle_us`, the scan before at `previous_us`.
     ///
     /// Without a previous scan the increment is the identity. `None` without samples. Work: at most
-    /// `K`·([`SWEEP_KNOTS`] + 3) steps.
+    /// 3·`K` + [`SWEEP_KNOTS`] steps.
     pub fn scan_motion(
         &self,
         previous_us: Option<u64>,
@@ -138,15 +145,15 @@ impl<const K: usize> OdometryTrack<K> {
             Some(previous) => self.between(previous, middle_us)?,
             None => Increment::identity(),
         };
-        let middle_from_odom = self.pose_at(middle_us)?.inverse();
         let half_sweep_us = geometry.sweep_us() / 2;
         let first_us = middle_us.saturating_sub(half_sweep_us);
-        let mut motion = ScanMotion::instantaneous(since_previous);
-        for (k, knot) in motion.middle_from_knot.iter_mut().enumerate() {
-            let at_us = first_us + 2 * half_sweep_us * k as u64 / (SWEEP_KNOTS as u64 - 1);
-            *knot = middle_from_odom * self.pose_at(at_us)?;
-        }
-        Some(motion)
+        let mut k = 0;
+        let knots = self.poses_at([(); SWEEP_KNOTS].map(|()| {
+            k += 1;
+            first_us + 2 * half_sweep_us * (k - 1) / (SWEEP_KNOTS as u64 - 1)
+        }))?;
+        let middle_from_odom = self.pose_at(middle_us)?.inverse();
+        Some(ScanMotion { since_previous, middle_from_knot: knots.map(|knot| middle_from_odom * knot) })
     }
 }
 

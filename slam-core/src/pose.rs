@@ -2,14 +2,19 @@
 //!
 //! A pose is named after its frames as a transform is: `map_from_base`. `pose` alone means `map_from_base`.
 
-use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
+use nalgebra::{Complex, Isometry2, Matrix3, Translation2, UnitComplex, Vector2, Vector3};
 
 use crate::math::{atan2, sin_cos, wrap_angle};
 
 /// The pose `(x, y, θ)` as an isometry; metres, radians.
 #[inline]
 pub fn pose(x_m: f32, y_m: f32, theta_rad: f32) -> Isometry2<f32> {
-    Isometry2::new(Vector2::new(x_m, y_m), theta_rad)
+    turned(x_m, y_m, sin_cos(theta_rad))
+}
+
+/// Not `Isometry2::new`, whose sine and cosine are `libm`'s, see [`sin_cos`].
+fn turned(x_m: f32, y_m: f32, (s, c): (f32, f32)) -> Isometry2<f32> {
+    Isometry2::from_parts(Translation2::new(x_m, y_m), UnitComplex::new_unchecked(Complex::new(c, s)))
 }
 
 /// Heading of a pose, in (-π, π].
@@ -57,7 +62,7 @@ pub fn exp(twist: &Vector3<f32>) -> Isometry2<f32> {
     } else {
         (s / angle, (1.0 - c) / angle)
     };
-    pose(sinc * twist.x - cosc * twist.y, cosc * twist.x + sinc * twist.y, angle)
+    turned(sinc * twist.x - cosc * twist.y, cosc * twist.x + sinc * twist.y, (s, c))
 }
 
 /// The constant twist that leads to a motion in one unit of time: logarithm of SE(2), inverse of [`exp`].

@@ -6,15 +6,16 @@
 //! The paper (equation (10), Fig. 6) joins by the line through the four end points. The default hands the pairs to the
 //! [`Joint`] estimate, which moves pose and lines together, and fuses map segments that turn out to be one wall.
 
-use heapless::{Vec, VecView};
+use heapless::Vec;
 use nalgebra::{Isometry2, Point2};
 
 use crate::association::Pair;
 use crate::extraction::MAX_SEGMENTS;
-use crate::joint::{Joint, Measurement, variances, with_variances};
+use crate::joint::{Joint, Learning, Measurement, Weighed, variances, with_variances};
 use crate::keyframe::KeyframeConfig;
 use crate::map::{MapSegment, SegmentMap};
 use crate::math::wrap_angle;
+use crate::nearby::Nearby;
 use crate::pose::{components, cross};
 use crate::residual::{LineNoise, Residual};
 use crate::segment::{Moments, Segment};
@@ -37,6 +38,12 @@ pub enum RegistrationConfig {
 pub struct JointConfig {
     /// Which scans are taken in.
     pub keyframes: KeyframeConfig,
+    /// Most sightings that are taken in of a scan, those that tell most.
+    pub max_taken: u8,
+    /// Most of those from which everything learns; from the others only the robot and the line that was seen.
+    pub max_learning: u8,
+    /// A number that would tell less than this is passed over: variance of what it measures, over its own.
+    pub least_gain: f32,
     /// A pair that fits worse than this χ² changes nothing.
     pub max_chi2: f32,
     /// A pair that fits worse than this χ² counts for less: its variance grows with its χ².
@@ -95,6 +102,8 @@ pub struct Observed<'a> {
     pub pairs: &'a [Pair],
     /// When they were seen.
     pub stamp: Stamp,
+    /// How far the sensor sees, metres.
+    pub reach_m: f32,
     /// Errors of lines beyond their points' noise.
     pub line_noise: &'a LineNoise,
 }
@@ -155,50 +164,54 @@ pub struct Start<'a> {
 }
 
 /// Joint estimate of the pose, the odometry's errors and the lines, from the pairs of a scan; what is not known is added.
-/// Returns the pose.
+/// Returns the pose, and in `near` the map segments around it.
 ///
 /// Work: for each pair, the square of the number of states tracked; for fusing, one step for each map segment that was
-/// seen and each map segment.
+/// seen and each one around the robot, and one for each map segment.
 pub fn register_jointly<const N: usize>(
     seen: &Observed<'_>,
     start: &Start<'_>,
     config: &JointConfig,
     joint: &mut Joint,
     map: &mut SegmentMap<N>,
+    near: &mut Nearby<N>,
 ) -> (Isometry2<f32>, RegistrationReport) {
     let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
-    let mut matched: Vec<Pair, MAX_SEGMENTS> = Vec::new();
-    let position = start.prior.translation.vector;
-    let mut since_prior = components(start.pose) - components(start.prior);
-    since_prior.z = wrap_angle(since_prior.z);
-    for pair in seen.pairs {
-        let Some(segment) = seen.segments.get(pair.observed) else { continue };
-        let Some(place) = joint.track(pair.mapped, map, seen.stamp.scan) else {
+    let mut sightings: Vec<Sighting, MAX_SEGMENTS> = Vec::new();
+    for &pair in seen.pairs {
+        // As many pairs as observed segments at most.
+        match Sighting::new(pair, seen, start, joint, map) {
+            Some(sighting) => drop(sightings.push(sighting)),
+            None => report.doubtful += 1,
+        }
+    }
+    for index in 0..sightings.len() {
+        let rank = rank(&sightings, index);
+        let Some(sighting) = sightings.get_mut(index) else { break };
+        let Some(measurement) = sighting.pair.measurement(sighting.place, seen, start, map) else { continue };
+        let Weighed { chi2, gains } = joint.weigh(&measurement);
+        sighting.fits = chi2 <= config.max_chi2;
+        let Some(entry) = map.get_mut(sighting.pair.mapped).filter(|_| sighting.fits) else {
             report.doubtful += 1;
             continue;
         };
-        let Some(entry) = map.get_mut(pair.mapped) else { continue };
-        let length_m = segment.length_m().min(entry.segment.length_m());
-        let variances = with_line_noise(variances(segment), seen.line_noise, length_m);
-        let segment = segment.transformed(start.pose);
-        let measurement =
-            Measurement::of_pair(place, &entry.segment, &segment, position, &since_prior, variances);
-        let chi2 = joint.chi2(&measurement);
-        if chi2.is_nan() || chi2 > config.max_chi2 {
-            report.doubtful += 1;
-            continue;
-        }
         let doubted = entry.hits < config.young_hits
-            && joint.age_scans(place) > config.young_scans_per_hit * f32::from(entry.hits);
-        let only = doubted.then_some(place);
-        joint.measure(&measurement, (chi2 / config.kernel_chi2).max(1.0), only);
+            && joint.age_scans(sighting.place) > config.young_scans_per_hit * f32::from(entry.hits);
+        let learning = match sighting.place {
+            place if doubted => Some(Learning::Line(place)),
+            _ if rank < usize::from(config.max_learning) => Some(Learning::All),
+            place if rank < usize::from(config.max_taken) => Some(Learning::RobotAndLine(place)),
+            _ => None,
+        };
+        if let Some(learning) = learning {
+            let factor = (chi2 / config.kernel_chi2).max(1.0);
+            joint.measure(&measurement, factor, gains.map(|gain| gain >= config.least_gain), learning);
+        }
         mark_seen(entry, &seen.stamp);
         report.matched += 1;
-        // As many pairs as observed segments at most.
-        let _ = matched.push(*pair);
     }
     let mut pose = joint.settle(start.prior, map);
-    for pair in &matched {
+    for Sighting { pair, .. } in sightings.iter().filter(|s| s.fits) {
         let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
         else {
             continue;
@@ -217,12 +230,65 @@ pub fn register_jointly<const N: usize>(
         if segment.is_finite()
             && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
         {
-            joint.add(index, pose.translation.vector, map, seen.stamp.scan);
+            joint.add(index, pose.translation.vector, map);
             report.new += 1;
         }
     }
-    fuse_walls(seen, config, &mut pose, joint, map);
+    fuse_walls(seen, config, &mut pose, joint, map, near);
     (pose, report)
+}
+
+/// A map segment seen again, for the joint estimate.
+struct Sighting {
+    pair: Pair,
+    /// Of the map segment among the lines tracked.
+    place: usize,
+    /// What it would tell before anything of this scan is taken in, see [`Weighed::gain`].
+    gain: f32,
+    /// Whether it agrees with what has been measured before it.
+    fits: bool,
+}
+
+impl Sighting {
+    fn new<const N: usize>(
+        pair: Pair,
+        seen: &Observed<'_>,
+        start: &Start<'_>,
+        joint: &mut Joint,
+        map: &mut SegmentMap<N>,
+    ) -> Option<Self> {
+        let place = joint.track(pair.mapped, map)?;
+        let gain = joint.weigh(&pair.measurement(place, seen, start, map)?).gains.iter().sum();
+        Some(Self { pair, place, gain, fits: false })
+    }
+}
+
+/// How many sightings tell more than one of them. Taken in in that order, those that are least known, and may be wrong, would
+/// come first: the order stays that of the scan.
+fn rank(sightings: &[Sighting], index: usize) -> usize {
+    let gain = sightings.get(index).map_or(0.0, |s| s.gain);
+    sightings.iter().enumerate().filter(|(i, s)| s.gain > gain || s.gain == gain && *i < index).count()
+}
+
+impl Pair {
+    /// What the pair says of the pose and of the line tracked at `place`.
+    fn measurement<const N: usize>(
+        &self,
+        place: usize,
+        seen: &Observed<'_>,
+        start: &Start<'_>,
+        map: &SegmentMap<N>,
+    ) -> Option<Measurement> {
+        let segment = seen.segments.get(self.observed)?;
+        let mapped = &map.segments().get(self.mapped)?.segment;
+        let length_m = segment.length_m().min(mapped.length_m());
+        let variances = with_line_noise(variances(segment), seen.line_noise, length_m);
+        let segment = segment.transformed(start.pose);
+        let position = start.prior.translation.vector;
+        let mut since_prior = components(start.pose) - components(start.prior);
+        since_prior.z = wrap_angle(since_prior.z);
+        Some(Measurement::of_pair(place, mapped, &segment, position, &since_prior, variances))
+    }
 }
 
 fn with_line_noise([offset, direction]: [f32; 2], noise: &LineNoise, length_m: f32) -> [f32; 2] {
@@ -240,24 +306,35 @@ fn joined_by_end_points(mapped: &Segment, seen: &Segment) -> Segment {
     Segment::fitted(moments, &ends, mapped.midpoint() + mapped.normal())
 }
 
-/// Fuses each map segment that this scan changed with those that are the same wall.
+/// Fuses each map segment that this scan changed with those that are the same wall. Leaves the segments around the robot in
+/// `near`.
 fn fuse_walls<const N: usize>(
     seen: &Observed<'_>,
     config: &JointConfig,
     pose: &mut Isometry2<f32>,
     joint: &mut Joint,
     map: &mut SegmentMap<N>,
+    near: &mut Nearby<N>,
 ) {
-    let mut index = 0;
-    while let Some(changed) = map.segments().get(index).copied() {
-        let is_twin = |(i, s): (usize, &MapSegment)| {
-            i != index && one_wall(&changed, s, &pose.translation.vector.into(), seen.line_noise, config)
+    near.gather(map.segments(), pose, seen.reach_m, |_| true);
+    let mut next = 0;
+    while let Some(index) = near.all().get(next).copied().map(usize::from) {
+        let Some(changed) = map.segments().get(index).copied() else { break };
+        let is_twin = |other: &usize| {
+            *other != index
+                && map.segments().get(*other).is_some_and(|s| {
+                    one_wall(&changed, s, &pose.translation.vector.into(), seen.line_noise, config)
+                })
         };
         let twin = (changed.last_seen == seen.stamp.scan)
-            .then(|| map.segments().iter().enumerate().position(is_twin))
+            .then(|| {
+                near.along(changed.segment.direction, config.fuse_max_angle_rad)
+                    .map(usize::from)
+                    .find(is_twin)
+            })
             .flatten();
         let Some(twin) = twin else {
-            index += 1;
+            next += 1;
             continue;
         };
         let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment.moments.inliers);
@@ -269,7 +346,10 @@ fn fuse_walls<const N: usize>(
         let last = map.segments().len();
         joint.removed(gone, last, map);
         // The grown segment is looked at again, wherever it went.
-        index = if kept == last { gone } else { kept };
+        let grown = if kept == last { gone } else { kept };
+        near.gather(map.segments(), pose, seen.reach_m, |_| true);
+        let all = near.all();
+        next = all.iter().position(|i| usize::from(*i) >= grown).unwrap_or(all.len());
     }
 }
 
@@ -282,14 +362,14 @@ fn agree<const N: usize>(
     joint: &mut Joint,
     map: &mut SegmentMap<N>,
 ) -> Option<Isometry2<f32>> {
-    let [kept, gone] = twins.map(|index| joint.track(index, map, seen.stamp.scan));
+    let [kept, gone] = twins.map(|index| joint.track(index, map));
     let [a, b] = twins.map(|index| map.segments().get(index).map(|s| s.segment));
     let (a, b) = (a?, b?);
     let length_m = a.length_m().min(b.length_m());
     let variances = with_line_noise([0.0, 0.0], seen.line_noise, length_m);
     let measurement = Measurement::of_twins((&a, kept?), (&b, gone?), variances);
-    (joint.chi2(&measurement) <= config.fuse_chi2).then(|| {
-        joint.measure(&measurement, 1.0, None);
+    (joint.weigh(&measurement).chi2 <= config.fuse_chi2).then(|| {
+        joint.measure(&measurement, 1.0, [true; 2], Learning::All);
         joint.settle(pose, map)
     })
 }
@@ -305,13 +385,16 @@ fn one_wall(
 ) -> bool {
     let (a, b) = (&a.segment, &b.segment);
     let facing = a.direction.dot(&b.direction) > 0.0;
-    // The shorter one is judged by the longer one's line.
-    let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
-    let (angle, distance, overlap_m) =
-        (cross(long.direction, short.direction).abs(), distance_m(long, short), long.overlap_m(short));
-    if !facing || angle > config.fuse_max_angle_rad || distance > config.fuse_max_distance_m {
+    if !facing || cross(a.direction, b.direction).abs() > config.fuse_max_angle_rad {
         return false;
     }
+    // The shorter one is judged by the longer one's line.
+    let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
+    let distance = distance_m(long, short);
+    if distance > config.fuse_max_distance_m {
+        return false;
+    }
+    let overlap_m = long.overlap_m(short);
     let hides = overlap_m >= config.fuse_overlap * short.length_m()
         && distance <= config.fuse_sigmas * noise.sigma_offset_m;
     let agrees = || {
@@ -327,19 +410,6 @@ fn one_wall(
 fn distance_m(long: &Segment, short: &Segment) -> f32 {
     let line = long.line();
     line.signed_distance(short.start).abs().max(line.signed_distance(short.end).abs())
-}
-
-/// Indices of the map segments within `reach_m` of the pose: those a scan from there can touch.
-pub fn within_reach(map: &[MapSegment], pose: &Isometry2<f32>, reach_m: f32, candidates: &mut VecView<u16>) {
-    candidates.clear();
-    for (index, entry) in map.iter().enumerate() {
-        let to_middle = entry.segment.midpoint().coords - pose.translation.vector;
-        let radius = reach_m + 0.5 * entry.segment.length_m();
-        if to_middle.norm_squared() <= radius * radius {
-            // At most as many as the map holds, which is the capacity.
-            let _ = candidates.push(index as u16);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -366,7 +436,7 @@ mod tests {
     }
 
     fn observed<'a>(segments: &'a [Segment], pairs: &'a [Pair], scan: u32) -> Observed<'a> {
-        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, line_noise: &NOISE }
+        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, line_noise: &NOISE, reach_m: 5.6 }
     }
 
     /// A robot that stands at the origin and is sure of it.
@@ -379,7 +449,8 @@ mod tests {
     ) -> RegistrationReport {
         let here = pose(0.0, 0.0, 0.0);
         let start = Start { prior: &here, pose: &here };
-        register_jointly(&observed(segments, pairs, scan), &start, &config(), joint, map).1
+        let mut near = Nearby::new();
+        register_jointly(&observed(segments, pairs, scan), &start, &config(), joint, map, &mut near).1
     }
 
     fn joint() -> Joint {
@@ -476,18 +547,5 @@ mod tests {
         let after = map.segments()[0].segment;
         assert_eq!((after.start, after.end, after.direction), (before.start, before.end, before.direction));
         assert_eq!(map.segments()[0].hits, 1);
-    }
-
-    #[test]
-    fn segments_out_of_reach_are_no_candidates() {
-        let mut map = SegmentMap::<8>::new();
-        for wall in
-            [wall((4.0, 0.0), (4.0, 1.0)), wall((9.0, 0.0), (9.0, 1.0)), wall((-20.0, 1.0), (20.0, 1.0))]
-        {
-            map.insert(wall, 1, 0.0);
-        }
-        let mut candidates: Vec<u16, 8> = Vec::new();
-        within_reach(map.segments(), &pose(0.0, 0.0, 0.0), 5.6, &mut candidates);
-        assert_eq!(candidates, [0, 2]);
     }
 }

@@ -72,6 +72,16 @@ impl RangeCodes {
     /// The URG-04LX: distances from 20 mm to 5600 mm, 0 and 6 for "nothing in range".
     pub const URG_04LX: Self = Self { min_mm: 20, max_mm: 5600, no_echo_mm: [(0, 0), (6, 6)] };
 
+    /// Values that are distances whatever else is configured; empty where a code for "nothing in range" lies among the
+    /// distances.
+    pub fn plain_distances(&self) -> core::ops::RangeInclusive<u16> {
+        let among = |&(from, to): &(u16, u16)| from <= to && from <= self.max_mm && to >= self.min_mm;
+        if self.no_echo_mm.iter().any(among) {
+            return core::ops::RangeInclusive::new(1, 0);
+        }
+        self.min_mm..=self.max_mm
+    }
+
     /// What one value of a scan means.
     pub fn read(&self, value_mm: u16) -> Reading {
         let no_echo = self.no_echo_mm.iter().any(|&(from, to)| (from..=to).contains(&value_mm));

@@ -3,28 +3,28 @@
 use core::mem::MaybeUninit;
 use heapless::Vec;
 
-use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
+use nalgebra::{Isometry2, Matrix3, Vector3};
 
-use crate::association::{AssociationConfig, Pair, View, associate};
+use crate::association::{AssociationConfig, Pair, Shortlist, View, associate};
 use crate::config::{ConfigError, SlamConfig};
 use crate::correction::{
     Correction, CorrectionConfig, Observability, Prior, SearchConfig, Verdict, least_squares,
     maximum_a_posteriori,
 };
-use crate::deskew::{DeskewReport, ScanPoint, deskew, fill_bearings};
+use crate::deskew::{DeskewReport, ScanPoint, deskew};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
 use crate::keyframe::Keyframe;
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, MapSegment, SegmentMap};
 use crate::math::{sqrt, within, wrap_angle};
+use crate::nearby::Nearby;
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
 use crate::pose::{components, is_finite, perpendicular, pose, rotate_covariance};
 use crate::registration::{
     Observed, RegistrationConfig, RegistrationReport, Stamp, Start, register_end_points, register_jointly,
-    within_reach,
 };
 use crate::scan::Scan;
 use crate::segment::Segment;
@@ -32,7 +32,7 @@ use crate::visibility::{is_gone, mark_seen_through};
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///
-/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 24 for each beam and 27 KiB.
+/// RAM: [`Slam::BYTES`], about 68 bytes for each map segment, 16 for each beam and 28 KiB.
 pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     config: SlamConfig,
     map: SegmentMap<N>,
@@ -44,11 +44,11 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     closing: PendingClosure,
     joint: Option<Joint>,
     keyframe: Keyframe,
-    bearings: Vec<Vector2<f32>, BEAMS>,
     points: Vec<ScanPoint, BEAMS>,
     observed: Vec<Segment, MAX_SEGMENTS>,
     pairs: Vec<Pair, MAX_SEGMENTS>,
-    candidates: Vec<u16, N>,
+    nearby: Nearby<N>,
+    shortlist: Shortlist,
 }
 
 /// What happened since the start.
@@ -200,11 +200,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             closing: PendingClosure::default(),
             joint: None,
             keyframe: Keyframe::at(Isometry2::identity()),
-            bearings: Vec::new(),
             points: Vec::new(),
             observed: Vec::new(),
             pairs: Vec::new(),
-            candidates: Vec::new(),
+            nearby: Nearby::new(),
+            shortlist: Shortlist::default(),
         }
     }
 
@@ -214,7 +214,6 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             let sigmas = self.odometry_sigmas();
             self.joint.insert(Joint::blank()).prepare(sigmas);
         }
-        fill_bearings(&self.config.sensor, &mut self.bearings);
     }
 
     /// The settings.
@@ -423,7 +422,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let still = ScanMotion::instantaneous(motion.since_previous);
         let motion = if motion.is_finite() { motion } else { &still };
         let (sensor, config) = (&self.config.sensor, &self.config);
-        update.deskew = deskew(scan, motion, sensor, &config.deskew, &self.bearings, &mut self.points);
+        update.deskew = deskew(scan, motion, sensor, &config.deskew, &mut self.points);
         watch(Stage::Extraction);
         update.extraction =
             extract(&self.points, sensor, &config.extraction, self.counters.scans, &mut self.observed);
@@ -438,7 +437,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         watch: &mut impl FnMut(Stage),
     ) {
         watch(Stage::Association);
-        self.find_candidates(&prior.pose);
+        self.find_nearby(&prior.pose, |_| true);
         let predicted = *update;
         self.refine(prior, update, watch);
         if let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction {
@@ -446,13 +445,24 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
     }
 
-    /// The map segments that a scan from this pose can touch; the paper looks at all of them.
-    fn find_candidates(&mut self, pose: &Isometry2<f32>) {
+    /// The map segments that a scan from this pose can touch and that count; the paper looks at all of them.
+    fn find_nearby(&mut self, pose: &Isometry2<f32>, counts: impl Fn(&MapSegment) -> bool) {
         let reach_m = match self.config.association {
             AssociationConfig::Bisector(_) => f32::INFINITY,
-            AssociationConfig::Gated(_) => f32::from(self.config.sensor.codes.max_mm) * 1e-3,
+            AssociationConfig::Gated(_) => self.reach_m(),
         };
-        within_reach(self.map.segments(), pose, reach_m, &mut self.candidates);
+        self.nearby.gather(self.map.segments(), pose, reach_m, counts);
+        self.shortlist.clear();
+    }
+
+    /// The scan at hand, as the map counts: from one, so that zero is a scan that never was.
+    fn scan_number(&self) -> u32 {
+        self.counters.scans.saturating_add(1)
+    }
+
+    /// How far the sensor sees, metres.
+    fn reach_m(&self) -> f32 {
+        f32::from(self.config.sensor.codes.max_mm) * 1e-3
     }
 
     /// Rounds of association and correction from the pose of `update`.
@@ -489,7 +499,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         best: &mut SlamUpdate,
         watch: &mut impl FnMut(Stage),
     ) {
-        if best.support >= config.below_support || self.candidates.is_empty() {
+        if best.support >= config.below_support || self.nearby.all().is_empty() {
             return;
         }
         let increment = &motion.since_previous;
@@ -528,17 +538,16 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         watch(Stage::Association);
         let (map, way_m) = (self.map.segments(), self.way_m);
         let age = |i: &u16| map.get(usize::from(*i)).map_or(0.0, |s| way_m - s.seen_at_m);
-        let all = self.candidates.clone();
-        let oldest = all.iter().map(age).fold(0.0, f32::max);
+        let oldest = self.nearby.all().iter().map(age).fold(0.0, f32::max);
         if oldest < config.min_way_m {
             return;
         }
-        self.candidates.retain(|i| age(i) >= config.min_way_m);
+        self.find_nearby(&update.pose, |entry| way_m - entry.seen_at_m >= config.min_way_m);
         let prior = Prior { pose: update.pose, covariance: update.covariance + drift(config, oldest) };
         let mut hypothesis = *update;
         hypothesis.covariance = prior.covariance;
         self.refine(&prior, &mut hypothesis, watch);
-        self.candidates = all;
+        self.find_nearby(&update.pose, |_| true);
         let seen =
             hypothesis.observability.verdict == Verdict::Full && hypothesis.support >= config.min_support;
         let drifted = chi2_between(&hypothesis.pose, &update.pose, &update.covariance) >= config.min_chi2;
@@ -579,7 +588,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let view =
             View { pose: &update.pose, covariance: &update.covariance, line_noise: &config.line_noise };
         let map = self.map.segments();
-        associate(&self.observed, &view, map, &self.candidates, &config.association, &mut self.pairs);
+        let (nearby, shortlist) = (&self.nearby, &mut self.shortlist);
+        associate(&self.observed, &view, map, nearby, &config.association, shortlist, &mut self.pairs);
     }
 
     fn step(&self, prior: &Prior, at: &Isometry2<f32>) -> Option<Correction> {
@@ -633,7 +643,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let seen = Observed {
             segments: &self.observed,
             pairs: &self.pairs,
-            stamp: Stamp { scan: self.counters.scans, way_m: self.way_m },
+            stamp: Stamp { scan: self.scan_number(), way_m: self.way_m },
+            reach_m: self.reach_m(),
             line_noise: &self.config.line_noise,
         };
         let (RegistrationConfig::Joint(config), Some(joint)) = (&self.config.registration, &mut self.joint)
@@ -647,7 +658,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             prior: &carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced),
             pose: &update.pose,
         };
-        let (pose, report) = register_jointly(&seen, &start, config, joint, &mut self.map);
+        let (pose, report) = register_jointly(&seen, &start, config, joint, &mut self.map, &mut self.nearby);
         update.registration = report;
         if is_finite(&pose) {
             update.pose = pose;
@@ -658,11 +669,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// Forgets what the scan has seen through.
     fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
         let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
-        // Fusing may have moved segments: what is within reach is found anew.
-        self.find_candidates(&update.pose);
-        let (sensor, scan_number) = (&self.config.sensor, self.counters.scans);
-        let candidates = &self.candidates;
-        mark_seen_through(scan, &update.pose, scan_number, sensor, &config, candidates, &mut self.map);
+        let (sensor, scan_number) = (&self.config.sensor, self.scan_number());
+        let nearby = self.nearby.all();
+        mark_seen_through(scan, &update.pose, scan_number, sensor, &config, nearby, &mut self.map);
         while let Some(index) = self.map.segments().iter().position(|s| is_gone(s, &config)) {
             self.map.forget(index);
             if let Some(joint) = &mut self.joint {

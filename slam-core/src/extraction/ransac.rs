@@ -81,6 +81,8 @@ impl Free {
 }
 
 /// Extracts segments. Work: at most [`MAX_SEGMENTS`] lines of `draws` passes over the points.
+// Not inlined: it takes 17 KiB of stack, which the default is not to pay for.
+#[inline(never)]
 pub(crate) fn extract(
     points: &[ScanPoint],
     view: &Viewpoint<'_>,

@@ -98,12 +98,12 @@ impl Extraction<'_> {
         if beams > self.config.max_missing_beams.saturating_add(1) {
             return false;
         }
-        let range_m = a.range_m.min(b.range_m);
-        let gap_m = self.config.max_gap_m.max(self.spacing_per_m * range_m * f32::from(beams));
         let apart2 = (b.position - a.position).norm_squared();
-        if apart2 <= gap_m * gap_m {
+        if apart2 <= self.config.max_gap_m * self.config.max_gap_m {
             return true;
         }
+        let range_m = a.range_m.min(b.range_m);
+        let gap_m = self.config.max_gap_m.max(self.spacing_per_m * range_m * f32::from(beams));
         // Noise alone sets neighbours √2·σ apart along the beam; a wall must not end where it happens to.
         let variance = 2.0 * self.view.sensor.noise.variance(range_m);
         let limit_m = gap_m + self.config.split_sigmas * sqrt(variance);
