@@ -23,6 +23,8 @@ mod robot;
 #[cfg(target_os = "none")]
 mod signs;
 #[cfg(target_os = "none")]
+mod stack;
+#[cfg(target_os = "none")]
 mod start;
 #[cfg(target_os = "none")]
 mod trace;

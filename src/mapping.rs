@@ -16,6 +16,7 @@ use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;
 use crate::kept::{Found, Keeper, Mapper};
 use crate::lidar::{STATE, ScanBuffer};
+use crate::stack;
 use crate::trace::{Event, Tracer, sigma};
 
 /// Unfed for so long, the watchdog resets the board. Its clock may run half as fast again as it should.
@@ -215,6 +216,11 @@ impl Mapping {
             STATE.losses.load(Ordering::Relaxed),
             slam.counters(),
             self.keeper.mapper().counters()
+        );
+        defmt::info!(
+            "stack: {=u32} bytes at most, {=u32} in the urgent executor",
+            stack::most(),
+            stack::most_in_interrupts()
         );
     }
 

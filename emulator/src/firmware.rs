@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use defmt_decoder::{DecodeError, StreamDecoder, Table};
+use object::{Object, ObjectSection, ObjectSymbol, SectionKind};
 use rigless::emulator::Host;
 use rigless::soc::Width;
 
@@ -14,12 +15,23 @@ pub struct Symbols {
     pub rtt: u64,
     /// The record of what was done to the map.
     pub trace: u64,
+    /// Bytes of all variables.
+    pub static_bytes: u64,
 }
 
 impl Symbols {
     /// Reads them from the ELF.
     pub fn read(elf: &[u8], path: &Path) -> anyhow::Result<Self> {
-        Ok(Self { rtt: address_of(RTT, elf, path)?, trace: address_of("TRACE", elf, path)? })
+        let file = object::File::parse(elf).with_context(|| path.display().to_string())?;
+        let variables = file
+            .sections()
+            .filter(|s| matches!(s.kind(), SectionKind::Data | SectionKind::UninitializedData))
+            .map(|s| s.size());
+        Ok(Self {
+            rtt: address_of(RTT, elf, path)?,
+            trace: address_of("TRACE", elf, path)?,
+            static_bytes: variables.sum(),
+        })
     }
 
     /// The control block of RTT of any firmware.
@@ -31,7 +43,6 @@ impl Symbols {
 const RTT: &str = "_SEGGER_RTT";
 
 fn address_of(name: &str, elf: &[u8], path: &Path) -> anyhow::Result<u64> {
-    use object::{Object, ObjectSymbol};
     let file = object::File::parse(elf).with_context(|| path.display().to_string())?;
     let symbol = file.symbols().find(|s| s.name() == Ok(name));
     symbol.map(|s| s.address()).with_context(|| format!("{}: there is no symbol {name}", path.display()))

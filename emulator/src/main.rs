@@ -184,6 +184,14 @@ fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
         ("map", format!("{} segments", r.segments)),
         ("a scan on the microcontroller", format!("median {median:.2} ms, p99 {p99:.2} ms, max {max:.2} ms")),
         ("of the processor's time", format!("{:.1} %", 100.0 * r.cpu_share)),
+        (
+            "RAM",
+            format!(
+                "{:.1} KiB of variables, {:.1} KiB of stack at most",
+                r.static_bytes as f64 / 1024.0,
+                f64::from(r.stack_bytes[0]) / 1024.0
+            ),
+        ),
         ("resets, warnings", format!("{}, {}", r.resets, r.warnings)),
         ("instructions", format!("{:.0} million", outcome.instructions as f64 * 1e-6)),
         ("written to", out.display().to_string()),

@@ -52,6 +52,10 @@ pub struct Report {
     pub resets: usize,
     /// Warnings and errors in the log.
     pub warnings: usize,
+    /// Most bytes of stack used: in all, and by the urgent executor. Zero where the run was too short to say.
+    pub stack_bytes: [u32; 2],
+    /// Bytes of the firmware's variables.
+    pub static_bytes: u64,
     /// Instructions executed.
     pub instructions: u64,
 }
@@ -126,9 +130,21 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
         cpu_share: busy_us as f64 / outcome.end_us.max(1) as f64,
         resets: outcome.resets.len(),
         warnings: outcome.log.iter().filter(|l| l.level == "WARN" || l.level == "ERROR").count(),
+        stack_bytes: stack_bytes(outcome),
+        static_bytes: outcome.static_bytes,
         instructions: outcome.instructions,
     };
     Ok(Judged { drive, poses, map, report })
+}
+
+/// What the firmware's status said of its stack, at the most.
+fn stack_bytes(outcome: &Outcome) -> [u32; 2] {
+    let said = outcome.log.iter().filter_map(|line| {
+        let (all, rest) = line.text.strip_prefix("stack: ")?.split_once(" bytes at most, ")?;
+        let (urgent, _) = rest.split_once(' ')?;
+        Some([all.parse().ok()?, urgent.parse().ok()?])
+    });
+    said.fold([0; 2], |most: [u32; 2], now: [u32; 2]| [most[0].max(now[0]), most[1].max(now[1])])
 }
 
 /// The map that the firmware printed last when its button was pressed.

@@ -88,6 +88,8 @@ pub struct Outcome {
     pub resets: Vec<(u64, String)>,
     /// Times that the LED was switched.
     pub led_changes: u32,
+    /// Bytes of the firmware's variables.
+    pub static_bytes: u64,
     /// Instructions executed.
     pub instructions: u64,
     /// Virtual time at the end, microseconds.
@@ -151,6 +153,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         console: String::from_utf8_lossy(&room.console).into_owned(),
         resets,
         led_changes: director.led_changes,
+        static_bytes: symbols.static_bytes,
         instructions: stop.instruction_count,
         end_us: stop.at.0 / 1000,
         arrived: room.building.arrived(),

@@ -12,7 +12,7 @@ fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
     let report = &judged.report;
     println!("{report:#?}");
     assert!(outcome.arrived);
-    assert!(report.corner_error_m.is_some_and(|e| e <= 0.050), "{:?}", report.corner_error_m);
+    assert!(report.corner_error_m.is_some_and(|e| e <= 0.030), "{:?}", report.corner_error_m);
     assert!(report.corners_found * 2 >= report.corners);
     assert!(report.worst_position_error_m < 0.15);
     // The one that is on its way at the end.
@@ -27,6 +27,11 @@ fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
     let poses = outcome.console.lines().filter(|l| l.split(' ').count() == 8).count();
     assert!(poses * 100 >= report.scans_used * 95, "{poses} of {}", report.scans_used);
     assert!(outcome.led_changes > 100);
+    // Variables and stack, of the executor in thread mode with all interrupts on top.
+    let [stack, urgent] = report.stack_bytes;
+    assert!(stack > 2000 && urgent > 200, "{stack} {urgent}");
+    let bytes = report.static_bytes + u64::from(stack);
+    assert!(bytes <= 96 * 1024, "{bytes} bytes of RAM");
 }
 
 #[test]

@@ -28,7 +28,7 @@ static URGENT: InterruptExecutor = InterruptExecutor::new();
 #[interrupt]
 unsafe fn UART5() {
     // SAFETY: this is the executor's interrupt, and only it calls this.
-    unsafe { URGENT.on_interrupt() }
+    crate::stack::watched(|| unsafe { URGENT.on_interrupt() })
 }
 
 /// Starts the executor of what must not wait for the map. To be called once.
