@@ -5,20 +5,16 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
-use lineslam::replay::{self, Step};
 use lineslam::robot::Robot;
-use lineslam::sim::world::World;
-use lineslam::sim::{self, SimConfig};
+use lineslam::sim::fixed_set::FixedSet;
 use nalgebra::{Isometry2, Vector2};
-use slam_core::pose::{components, pose};
-use slam_core::{MapSegment, SlamConfig};
+use slam_core::MapSegment;
+use slam_core::pose::components;
 
 /// Scans in the set, one after the other.
 const SCANS: usize = 300;
 /// Segments of the largest map.
 const SEGMENTS: usize = 500;
-/// Copies of the building stand so far apart, metres.
-const APART_M: f32 = 60.0;
 
 fn main() {
     for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {
@@ -45,30 +41,29 @@ fn main() {
 }
 
 fn constants(world: &Path, robot: &Path) -> Result<String, Box<dyn Error>> {
-    let (world, robot) = (World::load(world)?, Robot::load(robot)?);
-    let drive = sim::drive(&world, &robot, &SimConfig::default(), 1)?;
-    let replayed = replay::run(&drive.log, &robot, SlamConfig::default(), || {})?;
-    let from = (replayed.steps.len() - SCANS) / 2;
-    let steps = &replayed.steps[from..from + SCANS];
+    let set = FixedSet::new(world, &Robot::load(robot)?, SCANS)?;
+    let beams = set.ranges_mm.first().map_or(0, Vec::len);
     let mut text = String::new();
     writeln!(text, "/// Ranges of each scan, millimetres.")?;
-    writeln!(text, "pub static RANGES_MM: [[u16; {}]; {SCANS}] = [", drive.log.scans[from].ranges_mm.len())?;
-    for scan in &drive.log.scans[from..from + SCANS] {
-        writeln!(text, "{:?},", scan.ranges_mm)?;
+    writeln!(text, "static RANGES_MM: [[u16; {beams}]; {SCANS}] = [")?;
+    for ranges_mm in &set.ranges_mm {
+        writeln!(text, "{ranges_mm:?},")?;
     }
-    writeln!(text, "];\n/// Way, turn and motion since the scan before, and the sweep, of each scan.")?;
-    writeln!(text, "pub static MOTIONS: [(f32, f32, [f32; 3], [[f32; 3]; SWEEP_KNOTS]); {SCANS}] = [")?;
-    for step in steps {
-        let m = &step.motion;
-        let sweep: Vec<[f32; 3]> = m.middle_from_knot.iter().map(numbers).collect();
-        let last = &m.since_previous;
-        let moved = numbers(&last.before_from_after);
-        writeln!(text, "({:?}, {:?}, {moved:?}, {sweep:?}),", last.distance_m, last.turn_rad)?;
+    writeln!(text, "];\n/// The motion that led to each scan.")?;
+    writeln!(text, "static MOTIONS: [Motion; {SCANS}] = [")?;
+    for motion in &set.motions {
+        let sweep: Vec<[f32; 3]> = motion.middle_from_knot.iter().map(numbers).collect();
+        let last = &motion.since_previous;
+        let (way, turn, moved) = (last.distance_m, last.turn_rad, numbers(&last.before_from_after));
+        writeln!(
+            text,
+            "Motion {{ distance_m: {way:?}, turn_rad: {turn:?}, moved: {moved:?}, sweep: {sweep:?} }},"
+        )?;
     }
-    let begin = numbers(&replayed.steps[from - 1].pose_in_final_map);
-    writeln!(text, "];\n/// Where the robot was a scan before.\npub const BEGIN: [f32; 3] = {begin:?};")?;
-    writeln!(text, "/// The map: nearest to the way first.\npub static MAP: [MapSegment; {SEGMENTS}] = [")?;
-    for entry in map(&replayed.map, steps) {
+    let begin = numbers(&set.begin);
+    writeln!(text, "];\n/// Where the robot was a scan before.\nconst BEGIN: [f32; 3] = {begin:?};")?;
+    writeln!(text, "/// The map: nearest to the way first.\nstatic MAP: [MapSegment; {SEGMENTS}] = [")?;
+    for entry in set.map(SEGMENTS) {
         writeln!(text, "{},", literal(&entry))?;
     }
     writeln!(text, "];")?;
@@ -77,24 +72,6 @@ fn constants(world: &Path, robot: &Path) -> Result<String, Box<dyn Error>> {
 
 fn numbers(at: &Isometry2<f32>) -> [f32; 3] {
     components(at).into()
-}
-
-/// The building's own segments, then those of its copies beside it.
-fn map(own: &[MapSegment], steps: &[Step]) -> Vec<MapSegment> {
-    let from_way = |entry: &MapSegment| {
-        let middle = entry.segment.midpoint().coords;
-        steps
-            .iter()
-            .map(|s| (middle - s.pose_in_final_map.translation.vector).norm())
-            .fold(f32::MAX, f32::min)
-    };
-    let mut own = own.to_vec();
-    own.sort_by(|a, b| from_way(a).total_cmp(&from_way(b)));
-    let copies = (0..).flat_map(|copy| {
-        let beside = pose(0.0, copy as f32 * APART_M, 0.0);
-        own.iter().map(move |entry| MapSegment { segment: entry.segment.transformed(&beside), ..*entry })
-    });
-    copies.take(SEGMENTS).collect()
 }
 
 fn literal(entry: &MapSegment) -> String {

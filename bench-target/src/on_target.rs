@@ -14,6 +14,14 @@ use slam_core::segment::Moments;
 use slam_core::slam::Stage;
 use slam_core::{MapSegment, Scan, ScanMotion, Segment, Slam, SlamConfig};
 
+/// How the robot moved for a scan: since the scan before, and during it.
+struct Motion {
+    distance_m: f32,
+    turn_rad: f32,
+    moved: [f32; 3],
+    sweep: [[f32; 3]; SWEEP_KNOTS],
+}
+
 include!(concat!(env!("OUT_DIR"), "/set.rs"));
 
 /// Room for segments: that of the firmware.
@@ -48,7 +56,7 @@ fn main() -> ! {
 fn run(name: &str, config: SlamConfig, known: usize) {
     static mut SLAM: MaybeUninit<Slam<CAPACITY>> = MaybeUninit::uninit();
     // SAFETY: called from the only thread there is, and never from within itself.
-    let place = unsafe { &mut *(&raw mut SLAM) };
+    let place = unsafe { &mut *core::ptr::addr_of_mut!(SLAM) };
     let Ok(slam) = Slam::new_in(place, config) else {
         defmt::error!("the configuration {=str} cannot be used", name);
         return;
@@ -74,17 +82,15 @@ fn run(name: &str, config: SlamConfig, known: usize) {
     }
 }
 
-fn scan_motion(
-    (distance_m, turn_rad, moved, sweep): &(f32, f32, [f32; 3], [[f32; 3]; SWEEP_KNOTS]),
-) -> ScanMotion {
+fn scan_motion(motion: &Motion) -> ScanMotion {
     let at = |[x, y, heading]: [f32; 3]| pose(x, y, heading);
     ScanMotion {
         since_previous: Increment {
-            before_from_after: at(*moved),
-            distance_m: *distance_m,
-            turn_rad: *turn_rad,
+            before_from_after: at(motion.moved),
+            distance_m: motion.distance_m,
+            turn_rad: motion.turn_rad,
         },
-        middle_from_knot: sweep.map(at),
+        middle_from_knot: motion.sweep.map(at),
     }
 }
 
@@ -135,13 +141,15 @@ fn kernels() {
     defmt::println!("kernel loads {=u32} {=u32}", TURNS, loads);
 }
 
-/// Each function of libm that the core uses, beside micromath's.
+/// Each transcendental function that the core uses or might, of libm or its own, beside micromath's.
 fn functions() {
     use micromath::F32Ext;
     let angle = |k: u32| -3.1 + 0.097 * k as f32;
     function("sin", |k| libm::sinf(angle(k)), |k| F32Ext::sin(angle(k)));
     function("cos", |k| libm::cosf(angle(k)), |k| F32Ext::cos(angle(k)));
     function("atan2", |k| libm::atan2f(angle(k), angle(k + 7)), |k| F32Ext::atan2(angle(k), angle(k + 7)));
+    let both = |(s, c): (f32, f32)| s + c;
+    function("sin_cos", |k| both(slam_core::math::sin_cos(angle(k))), |k| both(F32Ext::sin_cos(angle(k))));
     function("sqrt", |k| libm::sqrtf(k as f32), |k| F32Ext::sqrt(k as f32));
 }
 

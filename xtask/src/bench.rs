@@ -1,5 +1,7 @@
 //! `cargo xtask bench`: what work costs, in instructions, counted by callgrind so that no other load matters.
 
+use std::path::Path;
+
 use anyhow::{Context, bail};
 
 use crate::run::{announce, cargo, debian_package, program, step, target_folder};
@@ -16,7 +18,9 @@ pub fn report() -> anyhow::Result<()> {
     announce("instructions to decode a scan of 682 points by MD (callgrind)");
     // The difference leaves out the start and end of the program.
     let (few, many) = (100, 1100);
-    let scan = (instructions(many)? - instructions(few)?) as f64 / f64::from(many - few);
+    let example = target_folder().join("release/examples/decode");
+    let scan =
+        (instructions_of(&example, many)? - instructions_of(&example, few)?) as f64 / f64::from(many - few);
     println!("{scan:.0} for each scan, {:.1} for each byte; at most {LIMIT} are allowed", scan / SCAN_BYTES);
     if scan / SCAN_BYTES > LIMIT {
         bail!("decoding takes more than {LIMIT} instructions for each byte");
@@ -24,11 +28,11 @@ pub fn report() -> anyhow::Result<()> {
     Ok(())
 }
 
-fn instructions(times: u32) -> anyhow::Result<u64> {
-    let example = target_folder().join("release/examples/decode");
+/// Instructions of an example that does its work so many times.
+pub fn instructions_of(example: &Path, times: u32) -> anyhow::Result<u64> {
     let output = program("valgrind")
         .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
-        .arg(&example)
+        .arg(example)
         .arg(times.to_string())
         .output()
         .context("cannot run valgrind")?;

@@ -97,6 +97,31 @@ pub fn demo() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Counts what each stage of the core takes, on the emulated core.
+pub fn bench() -> anyhow::Result<()> {
+    let mut command = bench_command()?;
+    step("instructions on the emulated core", &mut command)
+}
+
+/// The same, with what it prints.
+pub fn bench_output() -> anyhow::Result<String> {
+    let output = bench_command()?.output().context("cannot run the benchmark")?;
+    if !output.status.success() {
+        bail!("the benchmark failed:\n{}", String::from_utf8_lossy(&output.stderr));
+    }
+    String::from_utf8(output.stdout).context("the benchmark's output")
+}
+
+fn bench_command() -> anyhow::Result<std::process::Command> {
+    ensure_target()?;
+    let command = format!("build --quiet --release -p bench-target --target {TARGET}");
+    step("benchmark firmware", &mut cargo(&command))?;
+    build_emulator()?;
+    let mut command = program(target_folder().join("release/bench"));
+    command.arg("--firmware").arg(target_folder().join(TARGET).join("release/bench-target"));
+    Ok(command)
+}
+
 fn build_emulator() -> anyhow::Result<()> {
     // The emulated part asks for a newer compiler than it needs.
     step("emulator", &mut cargo("build --release -p emulator --ignore-rust-version"))

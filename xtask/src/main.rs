@@ -3,6 +3,7 @@
 
 mod bench;
 mod firmware;
+mod performance;
 mod run;
 mod size;
 mod test;
@@ -46,6 +47,10 @@ enum Task {
     Size,
     /// Instructions that decoding a scan takes, counted by callgrind.
     Bench,
+    /// Instructions of each stage of the core on an emulated Cortex-M4F, and of the functions it uses.
+    BenchTarget,
+    /// Measure what docs/performance.md says, on the emulated core and on this PC, and write it.
+    Performance,
 }
 
 fn main() -> ExitCode {
@@ -58,6 +63,8 @@ fn main() -> ExitCode {
         Task::Attach => firmware::attach(),
         Task::Size => size::report(),
         Task::Bench => bench::report(),
+        Task::BenchTarget => firmware::bench(),
+        Task::Performance => performance::report(),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

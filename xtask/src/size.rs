@@ -11,9 +11,10 @@ use crate::firmware::{self, Build};
 use crate::run::{announce, cargo, step, target_folder};
 
 /// Flash that the firmware may take: code, constants, and what variables begin with.
-const FLASH_BUDGET: u64 = 200 * 1024;
-/// RAM that its variables may take, the map for 512 segments among them; the rest of the board's 192 KiB is stack.
-const RAM_BUDGET: u64 = 96 * 1024;
+const FLASH_BUDGET: u64 = 160 * 1024;
+/// RAM that it may take, the map for 512 segments among it, less the stack, which is measured as it runs: a test of the
+/// emulated board holds both together to 96 KiB.
+const RAM_BUDGET: u64 = (96 - 9) * 1024;
 
 /// What a report prints of an ELF file.
 struct Sizes {
@@ -59,6 +60,21 @@ pub fn report() -> anyhow::Result<()> {
         bail!("the firmware is over its budget");
     }
     Ok(())
+}
+
+/// Flash and RAM of the firmware as a table in Markdown.
+pub fn summary() -> anyhow::Result<String> {
+    let sizes = read(&firmware::build(Build::Flashed)?)?;
+    let sum = |of: fn(&(String, u64, bool, bool)) -> bool| {
+        sizes.sections.iter().filter(|s| of(s)).map(|s| s.1).sum::<u64>() as f64 / 1024.0
+    };
+    Ok(format!(
+        "| firmware | KiB | budget |\n|---|---|---|\n| flash | {:.1} | {} |\n| variables, a map for 512 segments among them | {:.1} | {} |\n",
+        sum(|s| s.2),
+        FLASH_BUDGET / 1024,
+        sum(|s| s.3),
+        RAM_BUDGET / 1024
+    ))
 }
 
 /// The largest first.

@@ -22,6 +22,7 @@ pub fn everything() -> anyhow::Result<()> {
         "-p scip",
         "-p scip --all-features",
         "-p footprint",
+        "-p bench-target",
         "-p firmware",
         "-p firmware --features hang,sleeps",
     ] {
@@ -37,6 +38,7 @@ pub fn everything() -> anyhow::Result<()> {
     let elves = firmware::for_tests()?;
     size::report()?;
     bench::report()?;
+    firmware::bench()?;
     let python = referee_python();
     tests(python, &elves)
 }

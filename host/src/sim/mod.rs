@@ -5,6 +5,7 @@
 //! same log on every machine: all transcendental functions are `libm`'s.
 
 pub mod base;
+pub mod fixed_set;
 pub mod judge;
 pub mod scanner;
 pub mod world;
