@@ -179,10 +179,9 @@ impl Measured {
             let n = run.scans.len() as f64;
             let points = run.scans.iter().map(|s| f64::from(s.points)).sum::<f64>() / n;
             let of = |keyframe: bool| {
-                let mut all: Vec<u32> =
-                    run.scans.iter().filter(|s| s.keyframe == keyframe).map(Counted::total).collect();
-                all.sort_unstable();
-                all.get(all.len() / 2).copied().unwrap_or(0)
+                let [median, _, _] =
+                    percentiles(run.scans.iter().filter(|s| s.keyframe == keyframe).map(Counted::total));
+                median
             };
             println!(
                 "{} {}: {points:.0} points a scan; {} keyframes, median {}, of the others {}; {} segments at the end",
@@ -223,13 +222,46 @@ impl Measured {
 impl Run {
     /// Median, 99th percentile and maximum.
     pub fn percentiles(&self, of: impl Fn(&Counted) -> u32) -> [u32; 3] {
-        let mut all: Vec<u32> = self.scans.iter().map(of).collect();
-        all.sort_unstable();
-        let at = |share: f64| all.get(((all.len() as f64 * share) as usize).min(all.len().saturating_sub(1)));
-        [0.5, 0.99, 1.0].map(|share| at(share).copied().unwrap_or(0))
+        percentiles(self.scans.iter().map(of))
     }
+}
+
+/// Median, 99th percentile and maximum; zeros of nothing.
+fn percentiles(numbers: impl Iterator<Item = u32>) -> [u32; 3] {
+    let mut all: Vec<u32> = numbers.collect();
+    all.sort_unstable();
+    let at = |share: f64| all.get(((all.len() as f64 * share) as usize).min(all.len().saturating_sub(1)));
+    [0.5, 0.99, 1.0].map(|share| at(share).copied().unwrap_or(0))
 }
 
 fn cell([median, p99, max]: [u32; 3]) -> String {
     format!("{median} / {p99} / {max}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_firmware_says_is_taken_and_what_is_none_of_it_is_refused() {
+        let mut measured = Measured::default();
+        assert!(measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 50").is_err(), "no run has begun");
+        measured.take("run default 50").unwrap();
+        measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 51").unwrap();
+        measured.take("function sin 1262 22").unwrap();
+        assert_eq!(measured.functions, [("sin".to_owned(), 1262, 22)]);
+        let scan = measured.runs[0].scans[0];
+        assert_eq!((scan.total(), scan.points, scan.keyframe, scan.segments), (21, 600, true, 51));
+        for bad in
+            ["", "scan [1, 2] 600 true 51", "scan [1, 2, 3, 4, 5, x] 1 true 1", "run default", "walk 1"]
+        {
+            assert!(measured.take(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn percentiles_are_those_of_the_sorted_numbers() {
+        assert_eq!(percentiles((1..=200).rev()), [101, 199, 200]);
+        assert_eq!(percentiles(std::iter::empty()), [0; 3]);
+    }
 }

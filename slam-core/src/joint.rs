@@ -375,12 +375,7 @@ impl Joint {
     fn lower<const K: usize>(&mut self, innovations: [&Innovation; K], learning: Learning) {
         let states = self.states();
         let with = innovations.map(|i| &i.with);
-        // The first so many states learn, and one line.
-        let (first, own) = match learning {
-            Learning::All => (STATES, [0; 2]),
-            Learning::RobotAndLine(place) => (FIRST_LINE, states_of(place)),
-            Learning::Line(place) => (0, states_of(place)),
-        };
+        let (first, own) = learning.states();
         let mut rest = self.covariance.as_mut_slice();
         for state in 0..states {
             let Some((row, below)) = rest.split_at_mut_checked(state + 1) else { return };
@@ -389,7 +384,7 @@ impl Joint {
             if gains == [0.0; K] {
                 continue;
             }
-            if state < first || own.contains(&state) {
+            if learning.includes(state) {
                 subtract(row, 0, with, gains);
                 if let Some(variance) = row.last_mut() {
                     *variance = variance.max(LEAST_VARIANCE);
@@ -577,12 +572,18 @@ pub(crate) enum Learning {
 }
 
 impl Learning {
-    fn includes(self, state: usize) -> bool {
+    /// How many of the first states learn, and which two besides.
+    fn states(self) -> (usize, [usize; 2]) {
         match self {
-            Self::All => true,
-            Self::RobotAndLine(place) => state < FIRST_LINE || states_of(place).contains(&state),
-            Self::Line(place) => states_of(place).contains(&state),
+            Self::All => (STATES, [0, 1]),
+            Self::RobotAndLine(place) => (FIRST_LINE, states_of(place)),
+            Self::Line(place) => (0, states_of(place)),
         }
+    }
+
+    fn includes(self, state: usize) -> bool {
+        let (first, own) = self.states();
+        state < first || own.contains(&state)
     }
 }
 

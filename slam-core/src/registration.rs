@@ -166,7 +166,8 @@ pub struct Start<'a> {
 /// Joint estimate of the pose, the odometry's errors and the lines, from the pairs of a scan; what is not known is added.
 /// Returns the pose, and in `near` the map segments around it.
 ///
-/// Work: for each pair, the square of the number of states tracked; for fusing, one step for each map segment that was
+/// Work: for each sighting from which everything learns, the square of the number of states tracked, for the others that
+/// number; for fusing, one step for each map segment that was
 /// seen and each one around the robot, and one for each map segment.
 pub fn register_jointly<const N: usize>(
     seen: &Observed<'_>,
@@ -243,7 +244,7 @@ struct Sighting {
     pair: Pair,
     /// Of the map segment among the lines tracked.
     place: usize,
-    /// What it would tell before anything of this scan is taken in, see [`Weighed::gain`].
+    /// What it would tell before anything of this scan is taken in, both [`Weighed::gains`] added.
     gain: f32,
     /// Whether it agrees with what has been measured before it.
     fits: bool,

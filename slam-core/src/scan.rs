@@ -177,6 +177,21 @@ mod tests {
     }
 
     #[test]
+    fn plain_distances_are_distances_and_all_of_them_where_no_code_lies_among_them() {
+        let urg = RangeCodes::URG_04LX;
+        let among = RangeCodes { no_echo_mm: [(0, 0), (4000, 4000)], ..urg };
+        for codes in [urg, among] {
+            let plain = codes.plain_distances();
+            for value_mm in 0..=u16::MAX {
+                let is_range = matches!(codes.read(value_mm), Reading::Range(_));
+                assert!(is_range || !plain.contains(&value_mm), "{value_mm}");
+                assert!(codes == among || is_range == plain.contains(&value_mm), "{value_mm}");
+            }
+        }
+        assert!(among.plain_distances().is_empty());
+    }
+
+    #[test]
     fn no_echo_and_bad_readings_are_told_apart() {
         let codes = RangeCodes::URG_04LX;
         assert_eq!(codes.read(0), Reading::NoEcho);

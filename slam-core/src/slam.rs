@@ -670,6 +670,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
         let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
         let (sensor, scan_number) = (&self.config.sensor, self.scan_number());
+        // As the registration left them: fusing may have moved segments.
         let nearby = self.nearby.all();
         mark_seen_through(scan, &update.pose, scan_number, sensor, &config, nearby, &mut self.map);
         while let Some(index) = self.map.segments().iter().position(|s| is_gone(s, &config)) {
