@@ -135,7 +135,7 @@ impl Default for SlamConfig {
             }),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
             registration: RegistrationConfig::Joint(JointConfig {
-                keyframes: KeyframeConfig { way_m: 0.15, scans: 10, at_start: 10 },
+                keyframes: KeyframeConfig { way_m: 0.15, scans: 10, at_start: 4, spacing_between_m: 0.07 },
                 max_taken: 12,
                 max_learning: 6,
                 least_gain: 0.1,
@@ -289,6 +289,7 @@ impl SlamConfig {
             positive("registration.joint.kernel_chi2", c.kernel_chi2)?;
             positive("registration.joint.keyframes.way_m", c.keyframes.way_m)?;
             check("registration.joint.keyframes.scans", c.keyframes.scans > 0)?;
+            not_negative("registration.joint.keyframes.spacing_between_m", c.keyframes.spacing_between_m)?;
             not_negative("registration.joint.young_scans_per_hit", c.young_scans_per_hit)?;
             positive("registration.joint.fuse_max_angle_rad", c.fuse_max_angle_rad)?;
             positive("registration.joint.fuse_max_distance_m", c.fuse_max_distance_m)?;

@@ -13,6 +13,9 @@ use crate::math::sin_cos;
 use crate::odometry_track::{SWEEP_KNOTS, ScanMotion};
 use crate::scan::{Reading, Scan, SensorConfig};
 
+/// Most beams left out behind one that is placed.
+const MOST_LEFT_OUT: usize = 2;
+
 /// How scans are turned into points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -37,20 +40,24 @@ pub struct ScanPoint {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct DeskewReport {
-    /// Beams with a distance.
+    /// Beams with a distance, placed.
     pub points: u32,
+    /// Beams left out.
+    pub left_out: u32,
     /// Beams that saw nothing in range.
     pub no_echo: u32,
     /// Beams with an error code.
     pub bad: u32,
 }
 
-/// Places the beams of a scan. Work: one step for each beam.
+/// Places the beams of a scan. Up to two beams behind each one placed are left out where a surface that faces the sensor has its
+/// points no farther apart than `spacing_m` then; zero places all. Work: one step for each beam placed or without a distance.
 pub fn deskew(
     scan: &Scan<'_>,
     motion: &ScanMotion,
     sensor: &SensorConfig,
     config: &DeskewConfig,
+    spacing_m: f32,
     points: &mut VecView<ScanPoint>,
 ) -> DeskewReport {
     points.clear();
@@ -59,49 +66,54 @@ pub fn deskew(
     let knot_of_beam = (SWEEP_KNOTS - 1) as f32 / beams.saturating_sub(1).max(1) as f32;
     let first = sensor.geometry.first_step;
     let (used_from, used_to) = sensor.used_steps;
-    let unused = usize::from(used_from.saturating_sub(first));
-    let end = (usize::from(used_to) + 1).saturating_sub(usize::from(first));
+    let begin = usize::from(used_from.saturating_sub(first));
+    let end = (usize::from(used_to) + 1).saturating_sub(usize::from(first)).min(beams);
+    let used = scan.ranges_mm.get(..end).unwrap_or_default();
     let plain = sensor.codes.plain_distances();
+    let step_rad = sensor.geometry.step_rad();
+    // Behind a point nearer than each of these one beam more is left out.
+    let nearer_than_m: [f32; MOST_LEFT_OUT] =
+        core::array::from_fn(|k| spacing_m / (step_rad * (k + 2) as f32));
     let mut interval = Interval::new(motion, sensor, config, 0);
     let side = if sensor.mounting.upside_down { -1.0 } else { 1.0 };
     let unit = |angle_rad: f32| {
         let (s, c) = sin_cos(angle_rad);
         Complex::new(c, side * s)
     };
-    let (mut next, step) = (unit(sensor.geometry.bearing(unused)), unit(sensor.geometry.step_rad()));
-    for (beam, &value_mm) in scan.ranges_mm.iter().enumerate().take(end).skip(unused) {
-        let mut direction = next;
-        next *= step;
-        let range_m = if plain.contains(&value_mm) {
-            f32::from(value_mm) * 1e-3
+    let (mut beam, mut direction) = (begin, unit(sensor.geometry.bearing(begin)));
+    let turns: [_; MOST_LEFT_OUT + 1] = core::array::from_fn(|k| unit(step_rad * (k + 1) as f32));
+    while let Some(&value_mm) = used.get(beam) {
+        let reading = if plain.contains(&value_mm) {
+            Reading::Range(f32::from(value_mm) * 1e-3)
         } else {
-            match sensor.codes.read(value_mm) {
-                Reading::Range(range_m) => range_m,
-                Reading::NoEcho => {
-                    report.no_echo += 1;
-                    continue;
-                }
-                Reading::Bad => {
-                    report.bad += 1;
-                    continue;
-                }
-            }
+            sensor.codes.read(value_mm)
         };
-        let knot = beam as f32 * knot_of_beam;
-        let mut share = knot - interval.knot;
-        if share >= 1.0 {
-            interval = Interval::new(motion, sensor, config, (knot as usize).min(SWEEP_KNOTS - 2));
-            share = knot - interval.knot;
-            // From beam to beam by turning, from knot to knot anew: what rounding turns stays below 10 µrad.
-            direction = unit(sensor.geometry.bearing(beam));
-            next = direction * step;
+        let mut left_out = 0;
+        match reading {
+            Reading::Range(range_m) => {
+                let knot = beam as f32 * knot_of_beam;
+                let mut share = knot - interval.knot;
+                if share >= 1.0 {
+                    interval = Interval::new(motion, sensor, config, (knot as usize).min(SWEEP_KNOTS - 2));
+                    share = knot - interval.knot;
+                    // From beam to beam by turning, from knot to knot anew: what rounding turns stays below 10 µrad.
+                    direction = unit(sensor.geometry.bearing(beam));
+                }
+                let position = interval.place(direction * range_m, share);
+                if points.push(ScanPoint { position, range_m, beam: beam as u16 }).is_err() {
+                    break;
+                }
+                left_out = nearer_than_m.iter().filter(|limit| range_m < **limit).count();
+            }
+            Reading::NoEcho => report.no_echo += 1,
+            Reading::Bad => report.bad += 1,
         }
-        let position = interval.place(direction * range_m, share);
-        if points.push(ScanPoint { position, range_m, beam: beam as u16 }).is_err() {
-            break;
-        }
+        direction *= turns.get(left_out).copied().unwrap_or_default();
+        beam += 1 + left_out;
     }
     report.points = points.len() as u32;
+    let looked_at = report.points + report.no_echo + report.bad;
+    report.left_out = (end.saturating_sub(begin) as u32).saturating_sub(looked_at);
     report
 }
 
@@ -150,7 +162,7 @@ mod tests {
     fn run(sensor: &SensorConfig, ranges_mm: &[u16], motion: &ScanMotion) -> Vec<ScanPoint, 682> {
         let mut points = Vec::<ScanPoint, 682>::new();
         let config = DeskewConfig { enabled: true };
-        deskew(&Scan { ranges_mm }, motion, sensor, &config, &mut points);
+        deskew(&Scan { ranges_mm }, motion, sensor, &config, 0.0, &mut points);
         points
     }
 
@@ -166,6 +178,31 @@ mod tests {
         let points = run(&sensor, &ranges, &still());
         assert_eq!(points.len(), 1);
         assert!((points[0].position - Point2::new(2.14, 0.0)).norm() < 1e-6);
+    }
+
+    #[test]
+    fn beams_close_to_each_other_are_left_out() {
+        let sensor = SlamConfig::paper().sensor;
+        // 0.06 m are the spacing of each third beam at 3.26 m, of each second one at 4.89 m.
+        for (range_mm, stride) in [(1000, 3), (3200, 3), (3300, 2), (4800, 2), (4900, 1), (5600, 1)] {
+            let mut points = Vec::<ScanPoint, 682>::new();
+            let (scan, config) = (Scan { ranges_mm: &[range_mm; 682] }, DeskewConfig { enabled: true });
+            let report = deskew(&scan, &still(), &sensor, &config, 0.06, &mut points);
+            assert_eq!((points.len(), report.points), (682usize.div_ceil(stride), points.len() as u32));
+            let all = run(&sensor, scan.ranges_mm, &still());
+            for (placed, plain) in points.iter().zip(all.iter().step_by(stride)) {
+                assert!((placed.position - plain.position).norm() < 1e-4 && placed.beam == plain.beam);
+            }
+        }
+        let mut points = Vec::<ScanPoint, 682>::new();
+        let mut ranges_mm = [1000; 682];
+        (ranges_mm[3], ranges_mm[4], ranges_mm[7]) = (0, 16, 6);
+        let (scan, config) = (Scan { ranges_mm: &ranges_mm }, DeskewConfig { enabled: true });
+        let report = deskew(&scan, &still(), &sensor, &config, 0.06, &mut points);
+        assert_eq!(report.points + report.left_out + report.no_echo + report.bad, 682);
+        // Behind a beam without a distance the next one is looked at.
+        let placed: [u16; 3] = core::array::from_fn(|k| points[k].beam);
+        assert_eq!((report.no_echo, report.bad, placed), (1, 1, [0, 5, 8]));
     }
 
     #[test]

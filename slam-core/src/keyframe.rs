@@ -21,6 +21,9 @@ pub struct KeyframeConfig {
     pub scans: u32,
     /// All scans up to this number are keyframes: what is seen first says where the map's frame lies.
     pub at_start: u32,
+    /// A scan between keyframes only follows the robot. Beams of it are left out where that leaves points no farther apart than
+    /// this on a surface that faces the sensor, metres.
+    pub spacing_between_m: f32,
 }
 
 /// The last keyframe and the way since.
@@ -61,7 +64,8 @@ mod tests {
     use super::*;
     use crate::pose::pose;
 
-    const CONFIG: KeyframeConfig = KeyframeConfig { way_m: 0.1, scans: 5, at_start: 2 };
+    const CONFIG: KeyframeConfig =
+        KeyframeConfig { way_m: 0.1, scans: 5, at_start: 2, spacing_between_m: 0.0 };
 
     #[test]
     fn it_is_due_at_the_start_after_a_way_after_a_turn_and_after_a_while() {

@@ -249,7 +249,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.counters
     }
 
-    /// Points of the last scan, in `base` at its middle beam.
+    /// Points of the last scan that were placed, in `base` at its middle beam.
     pub fn points(&self) -> &[ScanPoint] {
         &self.points
     }
@@ -422,7 +422,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let still = ScanMotion::instantaneous(motion.since_previous);
         let motion = if motion.is_finite() { motion } else { &still };
         let (sensor, config) = (&self.config.sensor, &self.config);
-        update.deskew = deskew(scan, motion, sensor, &config.deskew, &mut self.points);
+        let spacing_m = self.spacing_m();
+        update.deskew = deskew(scan, motion, sensor, &config.deskew, spacing_m, &mut self.points);
         watch(Stage::Extraction);
         update.extraction =
             extract(&self.points, sensor, &config.extraction, self.counters.scans, &mut self.observed);
@@ -608,6 +609,16 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         match &self.config.correction {
             CorrectionConfig::LeastSquares => true,
             CorrectionConfig::MaximumAPosteriori(config) => correction.step <= config.converged_step,
+        }
+    }
+
+    /// How close to each other the points of the scan at hand need not be, metres.
+    fn spacing_m(&self) -> f32 {
+        match &self.config.registration {
+            RegistrationConfig::Joint(config) if !self.keyframe_is_due() => {
+                config.keyframes.spacing_between_m
+            }
+            _ => 0.0,
         }
     }
 
