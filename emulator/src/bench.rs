@@ -20,11 +20,9 @@ const GRID_US: u64 = 1000;
 /// A firmware that has not ended by then never will, microseconds of virtual time.
 const LONGEST_US: u64 = 3_600_000_000;
 
-/// Instructions that a scan is to take with the default configuration and 200 segments: median and 99th percentile. About
-/// 2 % and 4 % of the time between two scans.
-const GOAL: [u32; 2] = [250_000, 500_000];
-/// Instructions that it may take until the goal is reached: what it takes now, and a little more.
-const BUDGET: [u32; 2] = [300_000, 1_000_000];
+/// Instructions that a scan may take with the default configuration and [`BUDGET_SEGMENTS`] segments: median and 99th percentile.
+/// About 2 % and 4 % of the time between two scans.
+const BUDGET: [u32; 2] = [250_000, 500_000];
 const BUDGET_SEGMENTS: usize = 200;
 
 /// All that was counted.
@@ -204,10 +202,9 @@ impl Measured {
         let run = self.runs.iter().find(|r| r.name == "default" && r.known == BUDGET_SEGMENTS);
         let [median, p99, _] =
             run.context("the run that has a budget is missing")?.percentiles(Counted::total);
-        let reached = if median <= GOAL[0] && p99 <= GOAL[1] { "reached" } else { "not reached" };
         println!(
-            "\ndefault, {BUDGET_SEGMENTS} segments: median {median}, p99 {p99}; the goal of {} and {} is {reached}",
-            GOAL[0], GOAL[1]
+            "\ndefault, {BUDGET_SEGMENTS} segments: median {median}, p99 {p99}; {} and {} are allowed",
+            BUDGET[0], BUDGET[1]
         );
         ensure!(
             median <= BUDGET[0] && p99 <= BUDGET[1],

@@ -10,7 +10,7 @@ use crate::keyframe::KeyframeConfig;
 use crate::loop_closure::LoopConfig;
 use crate::odometry::{Integration, OdometryNoise};
 use crate::odometry_bias::BiasConfig;
-use crate::registration::{JointConfig, RegistrationConfig};
+use crate::registration::{JointConfig, MAX_TAKEN, RegistrationConfig};
 use crate::residual::LineNoise;
 use crate::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
 use crate::visibility::ForgetConfig;
@@ -138,6 +138,7 @@ impl Default for SlamConfig {
                 keyframes: KeyframeConfig { way_m: 0.15, scans: 10, at_start: 4, spacing_between_m: 0.07 },
                 max_taken: 12,
                 max_learning: 6,
+                taken_per_scan: 6,
                 least_gain: 0.1,
                 max_chi2: 60.0,
                 kernel_chi2: 1.5,
@@ -283,7 +284,8 @@ impl SlamConfig {
             check("forgetting.scans", c.scans > 0)?;
         }
         if let RegistrationConfig::Joint(c) = &self.registration {
-            check("registration.joint.max_taken", c.max_taken > 0)?;
+            check("registration.joint.max_taken", (1..=MAX_TAKEN).contains(&usize::from(c.max_taken)))?;
+            check("registration.joint.taken_per_scan", c.taken_per_scan > 0)?;
             not_negative("registration.joint.least_gain", c.least_gain)?;
             positive("registration.joint.max_chi2", c.max_chi2)?;
             positive("registration.joint.kernel_chi2", c.kernel_chi2)?;

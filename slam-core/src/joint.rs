@@ -12,6 +12,8 @@
 //! Offsets are along a line's normal at its centroid, which wanders along the line to where the offset is independent of
 //! the direction: the centroid of all points that were seen on it, as it were.
 
+use core::ops::Range;
+
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
 use crate::map::SegmentMap;
@@ -40,9 +42,6 @@ const CENTRED_SHARE: f32 = 0.01;
 /// Least variance of a state: beneath it `f32` has no digits left.
 const LEAST_VARIANCE: f32 = 1e-12;
 
-/// A measurement's derivative: state and coefficient, at most eight of them.
-type Row = heapless::Vec<(usize, f32), 8>;
-
 /// The joint estimate's covariance. RAM: 22 KiB.
 #[derive(Clone, Debug)]
 pub struct Joint {
@@ -65,10 +64,41 @@ pub struct Joint {
 /// How an observed segment differs from its map segment, and what the difference depends on.
 #[derive(Clone, Debug)]
 pub(crate) struct Measurement {
-    /// Offset (m) and direction (rad): error and derivative.
-    rows: [(f32, Row); 2],
-    /// Variances of both.
+    /// Offset (m) and direction (rad).
+    errors: [f32; 2],
+    /// Of both.
     variances: [f32; 2],
+    by: Derivative,
+}
+
+/// Derivatives of two numbers, an offset and a direction.
+#[derive(Clone, Debug)]
+struct Derivative {
+    by_pose: [[f32; 3]; 2],
+    /// By the offset and the direction of the line at a place.
+    by_lines: heapless::Vec<(usize, [[f32; 2]; 2]), 2>,
+}
+
+impl Derivative {
+    /// States on which the numbers depend, with the derivatives of both.
+    fn entries(&self) -> impl Iterator<Item = (usize, [f32; 2])> + Clone {
+        let [o, d] = self.by_pose;
+        let pose = (0..3).zip(o.into_iter().zip(d)).map(|(i, (o, d))| (POSE + i, [o, d]));
+        let of_line = |&(place, [o, d]): &(usize, [[f32; 2]; 2])| {
+            states_of(place).into_iter().zip(o.into_iter().zip(d)).map(|(state, (o, d))| (state, [o, d]))
+        };
+        pose.chain(self.by_lines.iter().flat_map(of_line))
+    }
+
+    /// What the numbers change by when all states change by these.
+    fn times(&self, changes: &[f32; STATES]) -> [f32; 2] {
+        let mut sums = [0.0; 2];
+        for (state, [o, d]) in self.entries() {
+            let change = changes.get(state).copied().unwrap_or(0.0);
+            sums = [sums[0] + o * change, sums[1] + d * change];
+        }
+        sums
+    }
 }
 
 /// Where the covariance of two states lies: the lower triangle, row by row.
@@ -155,6 +185,58 @@ impl Joint {
         }
     }
 
+    /// Covariance of each state with two numbers that have these derivatives.
+    fn covariance_with(&self, derivative: &Derivative) -> [[f32; STATES]; 2] {
+        let mut sums = [[0.0; STATES]; 2];
+        if derivative.by_pose != [[0.0; 3]; 2] {
+            self.add_columns(POSE, &derivative.by_pose, &mut sums);
+        }
+        for (place, by_line) in &derivative.by_lines {
+            let [first, _] = states_of(*place);
+            self.add_columns(first, by_line, &mut sums);
+        }
+        sums
+    }
+
+    /// Adds the covariances of all states with some that lie side by side, so many times each, to two sums.
+    fn add_columns<const W: usize>(
+        &self,
+        first: usize,
+        times: &[[f32; W]; 2],
+        sums: &mut [[f32; STATES]; 2],
+    ) {
+        let [sums_o, sums_d] = sums;
+        let [times_o, times_d] = times;
+        let all = self.states();
+        // Before them their columns lie as rows, …
+        for (w, (by_o, by_d)) in times_o.iter().zip(times_d).enumerate() {
+            let begin = packed(first + w, 0);
+            let row = self.covariance.get(begin..begin + first).unwrap_or_default();
+            for ((value, o), d) in row.iter().zip(sums_o.iter_mut()).zip(sums_d.iter_mut()) {
+                *o += by_o * value;
+                *d += by_d * value;
+            }
+        }
+        let mut add = |state: usize, values: &[f32; W]| {
+            let (Some(o), Some(d)) = (sums_o.get_mut(state), sums_d.get_mut(state)) else { return };
+            for ((value, by_o), by_d) in values.iter().zip(times_o).zip(times_d) {
+                *o += by_o * value;
+                *d += by_d * value;
+            }
+        };
+        for state in first..first + W {
+            add(state, &core::array::from_fn(|w| self.get(state, first + w)));
+        }
+        // … beyond them side by side in each row, which are each longer by one.
+        let mut at = packed(first + W, first);
+        for state in first + W..all {
+            if let Some(values) = self.covariance.get(at..).and_then(|rest| rest.first_chunk()) {
+                add(state, values);
+            }
+            at += state + 1;
+        }
+    }
+
     fn set(&mut self, i: usize, j: usize, value: f32) {
         if let Some(slot) = self.covariance.get_mut(packed(i, j)) {
             *slot = value;
@@ -235,8 +317,13 @@ impl Joint {
         self.ages_scans.get(place).copied().unwrap_or(0.0)
     }
 
+    /// Whether a line has this place.
+    pub(crate) fn tracks(&self, place: usize) -> bool {
+        self.owners.get(place).is_some_and(Option::is_some)
+    }
+
     /// The place of a map segment among the lines, if it is tracked.
-    fn place_of(&self, index: usize) -> Option<usize> {
+    pub(crate) fn place_of(&self, index: usize) -> Option<usize> {
         self.owners.iter().position(|owner| owner.is_some_and(|o| usize::from(o) == index))
     }
 
@@ -287,16 +374,24 @@ impl Joint {
         if let Some(turned) = self.turned.get_mut(place) {
             *turned = 0.0;
         }
+        if let Some(shift) = self.shift.get_mut(offset..=direction) {
+            shift.fill(0.0);
+        }
         self.in_use &= !(1 << place);
+    }
+
+    /// Ends the tracking of a line whose segment is no more.
+    fn vacate<const N: usize>(&mut self, place: usize, map: &mut SegmentMap<N>) {
+        if let Some(owner) = self.owners.get_mut(place) {
+            *owner = None;
+        }
+        self.release(place, map);
     }
 
     /// The map's segment `gone` is no more, and the one at `last` has taken its index.
     pub(crate) fn removed<const N: usize>(&mut self, gone: usize, last: usize, map: &mut SegmentMap<N>) {
         if let Some(place) = self.place_of(gone) {
-            if let Some(owner) = self.owners.get_mut(place) {
-                *owner = None;
-            }
-            self.release(place, map);
+            self.vacate(place, map);
         }
         if let Some(owner) = self.place_of(last).and_then(|place| self.owners.get_mut(place)) {
             *owner = u16::try_from(gone).ok();
@@ -305,108 +400,136 @@ impl Joint {
 
     /// What a measurement would say now, after what was measured before.
     pub(crate) fn weigh(&self, measurement: &Measurement) -> Weighed {
-        let [(error_o, row_o), (error_d, row_d)] = &measurement.rows;
-        let error = Vector2::new(error_o + self.moved(row_o), error_d + self.moved(row_d));
-        let [var_o, var_d] = measurement.variances;
-        let [known_o, known_d] = [row_o, row_d].map(|row| self.between(row, row));
-        let both = self.between(row_o, row_d);
-        let covariance = Matrix2::new(known_o + var_o, both, both, known_d + var_d);
-        Weighed {
-            chi2: covariance.try_inverse().map_or(f32::INFINITY, |w| error.dot(&(w * error))),
-            gains: [known_o / var_o, known_d / var_d],
+        let entries: heapless::Vec<_, 7> = measurement.by.entries().collect();
+        let mut known = Matrix2::zeros();
+        for (k, &(i, [o_i, d_i])) in entries.iter().enumerate() {
+            for &(j, [o_j, d_j]) in entries.iter().take(k) {
+                let value = self.get(i, j);
+                known.m11 += 2.0 * o_i * o_j * value;
+                known.m12 += (o_i * d_j + o_j * d_i) * value;
+                known.m22 += 2.0 * d_i * d_j * value;
+            }
+            let variance = self.get(i, i);
+            known.m11 += o_i * o_i * variance;
+            known.m12 += o_i * d_i * variance;
+            known.m22 += d_i * d_i * variance;
         }
+        Weighed::new(self.errors(measurement), &known, measurement)
     }
 
-    /// Takes in those numbers of a measurement, offset and direction, that `taken` names; its variances are so many times what
-    /// it says. Work: with [`Learning::All`] the square of the number of states, otherwise that number, some times.
-    pub(crate) fn measure(
+    /// Errors of a measurement after what was measured before.
+    fn errors(&self, measurement: &Measurement) -> [f32; 2] {
+        let ([offset, direction], [by_o, by_d]) = (measurement.errors, measurement.by.times(&self.shift));
+        [offset + by_o, direction + by_d]
+    }
+
+    /// Takes in a measurement, as far as it deserves it; false where it does not. Work: with [`Learning::All`] the square of the
+    /// number of states, otherwise that number, some times.
+    pub(crate) fn measure(&mut self, measurement: &Measurement, trust: &Trust, learning: Learning) -> bool {
+        let mut with = self.covariance_with(&measurement.by);
+        let [[o_with_o, d_with_o], [_, d_with_d]] = with.each_ref().map(|with| measurement.by.times(with));
+        let known = Matrix2::new(o_with_o, d_with_o, d_with_o, d_with_d);
+        let weighed = Weighed::new(self.errors(measurement), &known, measurement);
+        if weighed.chi2.is_nan() || weighed.chi2 > trust.max_chi2 {
+            return false;
+        }
+        let factor = (weighed.chi2 / trust.kernel_chi2).max(1.0);
+        let noise = measurement.variances.map(|variance| variance * factor);
+        let [offset, direction] = weighed.gains.map(|gain| gain >= trust.least_gain);
+        match learning {
+            // What only a line learns, the robot does not know when it is told the next.
+            Learning::Line(_) if offset && direction => {
+                self.take_in(measurement, &mut with, noise, [true, false], learning);
+                with = self.covariance_with(&measurement.by);
+                self.take_in(measurement, &mut with, noise, [false, true], learning);
+            }
+            _ => self.take_in(measurement, &mut with, noise, [offset, direction], learning),
+        }
+        true
+    }
+
+    /// Takes in those numbers of a measurement, offset and direction, that `taken` names.
+    #[inline]
+    fn take_in(
         &mut self,
         measurement: &Measurement,
-        variance_factor: f32,
+        with: &mut [[f32; STATES]; 2],
+        noise: [f32; 2],
         taken: [bool; 2],
         learning: Learning,
     ) {
-        // What has been told but not yet taken off the covariance.
-        let mut told: Option<Innovation> = None;
-        let numbers = measurement.rows.iter().zip(measurement.variances).zip(taken);
-        for (((error, row), variance), _) in numbers.filter(|(_, taken)| *taken) {
-            let innovation = self.innovation(row, variance * variance_factor).and_then(|i| match &told {
-                Some(told) => i.after(told, row),
-                None => Some(i),
-            });
-            let Some(innovation) = innovation else { continue };
-            self.shift_by(&innovation, error + self.moved(row), learning);
-            match (told.take(), learning) {
-                // What only a line learns, the robot does not know when it is told the next.
-                (_, Learning::Line(_)) => self.lower([&innovation], learning),
-                (Some(told), _) => self.lower([&told, &innovation], learning),
-                (None, _) => told = Some(innovation),
+        let [[o_with_o, d_with_o], [_, d_with_d]] = with.each_ref().map(|with| measurement.by.times(with));
+        let ([with_o, with_d], errors) = (with, self.errors(measurement));
+        let told = |taken, number: &Number| {
+            taken && number.variance > 0.0 && number.variance.is_finite() && number.error.is_finite()
+        };
+        let offset = Number { error: errors[0], variance: o_with_o + noise[0] };
+        let mut direction = Number { error: errors[1], variance: d_with_d + noise[1] };
+        let with_offset = told(taken[0], &offset);
+        if with_offset && taken[1] {
+            // What the direction says beyond what the offset has told.
+            let share = d_with_o / offset.variance;
+            with_d.iter_mut().zip(&*with_o).for_each(|(d, o)| *d -= share * o);
+            direction.error -= share * offset.error;
+            direction.variance -= share * d_with_o;
+        }
+        match (with_offset, told(taken[1], &direction)) {
+            (true, true) => self.learn([with_o, with_d], [offset, direction], learning),
+            (true, false) => self.learn([with_o], [offset], learning),
+            (false, true) => self.learn([with_d], [direction], learning),
+            (false, false) => {}
+        }
+    }
+
+    /// Learns from numbers that are independent of each other, and of which each state has these covariances.
+    fn learn<const K: usize>(&mut self, with: [&[f32; STATES]; K], numbers: [Number; K], learning: Learning) {
+        for range in learning.states() {
+            for (with, number) in with.iter().zip(&numbers) {
+                let by = number.error / number.variance;
+                let shifts = self.shift.get_mut(range.clone()).unwrap_or_default();
+                let with = with.get(range.clone()).unwrap_or_default();
+                shifts.iter_mut().zip(with).for_each(|(shift, with)| *shift -= with * by);
             }
         }
-        if let Some(told) = &told {
-            self.lower([told], learning);
-        }
+        self.lower(with, numbers.map(|number| 1.0 / number.variance), learning);
     }
 
-    /// What a row of a measurement says of all states; `None` where the numbers do not allow it.
-    fn innovation(&self, row: &Row, variance: f32) -> Option<Innovation> {
-        let mut with = [0.0; STATES];
-        let tracked = with.get_mut(..self.states())?;
-        for &(state, by) in row {
-            self.add_row(state, by, tracked);
-        }
-        Innovation { total: along(row, &with) + variance, with }.checked()
-    }
-
-    fn shift_by(&mut self, innovation: &Innovation, error: f32, learning: Learning) {
-        if !error.is_finite() {
-            return;
-        }
-        let by = error / innovation.total;
-        for (state, (shift, with)) in self.shift.iter_mut().zip(&innovation.with).enumerate() {
-            if learning.includes(state) {
-                *shift -= with * by;
-            }
-        }
-    }
-
-    /// Takes from the covariance what innovations that are independent of each other have told. What does not learn has no
-    /// gain; the gains of the others are those of the whole filter.
-    fn lower<const K: usize>(&mut self, innovations: [&Innovation; K], learning: Learning) {
-        let states = self.states();
-        let with = innovations.map(|i| &i.with);
-        let (first, own) = learning.states();
+    /// Takes from the covariance what such numbers have told; given are the inverses of their variances. What does not learn
+    /// has no gain; the gains of the others are those of the whole filter.
+    fn lower<const K: usize>(
+        &mut self,
+        with: [&[f32; STATES]; K],
+        information: [f32; K],
+        learning: Learning,
+    ) {
+        let ranges = learning.states();
         let mut rest = self.covariance.as_mut_slice();
-        for state in 0..states {
+        let states = self.owners.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
+        for state in 0..FIRST_LINE + 2 * states {
             let Some((row, below)) = rest.split_at_mut_checked(state + 1) else { return };
             rest = below;
-            let gains = innovations.map(|i| i.with.get(state).map_or(0.0, |with| with / i.total));
+            let mut gains = information;
+            gains
+                .iter_mut()
+                .zip(&with)
+                .for_each(|(gain, with)| *gain *= with.get(state).copied().unwrap_or(0.0));
             if gains == [0.0; K] {
                 continue;
             }
-            if learning.includes(state) {
+            if ranges.iter().any(|range| range.contains(&state)) {
                 subtract(row, 0, with, gains);
                 if let Some(variance) = row.last_mut() {
-                    *variance = variance.max(LEAST_VARIANCE);
+                    *variance = if *variance >= LEAST_VARIANCE { *variance } else { LEAST_VARIANCE };
                 }
                 continue;
             }
             // What it has in common with those that do learn.
-            for (begin, count) in [(0, first), (own[0], own.len())] {
-                if let Some(part) = row.get_mut(begin..(begin + count).min(state)) {
-                    subtract(part, begin, with, gains);
+            for range in &ranges {
+                if let Some(part) = row.get_mut(range.start..range.end.min(state)) {
+                    subtract(part, range.start, with, gains);
                 }
             }
         }
-    }
-
-    /// What the measurements so far have changed in a measurement's error.
-    fn moved(&self, row: &Row) -> f32 {
-        along(row, &self.shift)
-    }
-
-    fn between(&self, a: &Row, b: &Row) -> f32 {
-        a.iter().map(|&(i, by)| by * b.iter().map(|&(j, other)| other * self.get(i, j)).sum::<f32>()).sum()
     }
 
     /// Carries what was measured over to the pose, the odometry's errors and the segments of the map.
@@ -438,8 +561,8 @@ impl Joint {
                     // The normal turns away from the direction.
                     let normal_by = -moved.direction * core::mem::take(turned);
                     let from_robot = moved.moments.centroid.coords - settled.translation.vector;
-                    let [by_pose, _] = pose_rows(normal_by, from_robot);
-                    self.add_states(offset, &by_pose);
+                    let [[x, y, heading], _] = by_pose(normal_by, from_robot);
+                    self.add_states(offset, &[(POSE, x), (POSE + 1, y), (POSE + 2, heading)]);
                 }
             }
             let moved = self.centred(&moved, place, pose_information.as_ref());
@@ -514,20 +637,30 @@ impl Joint {
         within(own - explained, 0.01 * own, own).max(LEAST_VARIANCE)
     }
 
-    /// Tracks a segment just added to the map, seen from the pose with these variances of its own.
+    /// Tracks a segment just added to the map, with these variances of its own. It was seen from a pose that has the estimate's errors,
+    /// but lies `since_prior`, in (x, y, θ), from the pose of the estimate at `position`.
     pub(crate) fn add<const N: usize>(
         &mut self,
         index: usize,
         position: Vector2<f32>,
+        since_prior: &Vector3<f32>,
         map: &mut SegmentMap<N>,
     ) {
         let Some(segment) = map.segments().get(index).map(|s| s.segment) else { return };
         let [var_offset, var_direction] = variances(&segment);
-        let by_pose = pose_rows(segment.normal(), segment.moments.centroid.coords - position);
-        let Some(place) = self.free_place(map) else {
-            let rows = [self.between(&by_pose[0], &by_pose[0]), self.between(&by_pose[1], &by_pose[1])];
+        if let Some(dropped) = self.place_of(index) {
+            // The map has dropped a segment for this one.
+            self.vacate(dropped, map);
+        }
+        let by_pose = by_pose(segment.normal(), segment.moments.centroid.coords - position);
+        let seen = Derivative { by_pose, by_lines: heapless::Vec::new() };
+        let place = self.free_place(map);
+        let with = self.covariance_with(&seen);
+        let [[o_with_o, d_with_o], [_, d_with_d]] = with.each_ref().map(|with| seen.times(with));
+        let (var_offset, var_direction) = (o_with_o + var_offset, d_with_d + var_direction);
+        let Some(place) = place else {
             if let Some(entry) = map.get_mut(index) {
-                entry.segment = with_variances(&segment, var_offset + rows[0], var_direction + rows[1]);
+                entry.segment = with_variances(&segment, var_offset, var_direction);
             }
             return;
         };
@@ -535,19 +668,21 @@ impl Joint {
             (*owner, *age) = (u16::try_from(index).ok(), 0.0);
         }
         let own = states_of(place);
-        for (state, row) in own.into_iter().zip(&by_pose) {
-            for other in 0..self.states() {
-                if !own.contains(&other) {
-                    let value = row.iter().map(|&(i, by)| by * self.get(i, other)).sum();
-                    self.set(state, other, value);
-                }
+        for (own, with) in own.into_iter().zip(&with) {
+            for (other, value) in with.iter().enumerate().take(self.states()) {
+                self.set(own, other, *value);
             }
         }
         let [offset, direction] = own;
-        let [row_o, row_d] = &by_pose;
-        self.set(offset, offset, self.between(row_o, row_o) + var_offset);
-        self.set(direction, direction, self.between(row_d, row_d) + var_direction);
-        self.set(offset, direction, self.between(row_o, row_d));
+        self.set(offset, offset, var_offset);
+        self.set(direction, direction, var_direction);
+        self.set(offset, direction, d_with_o);
+        // The estimate has it where it lies as seen from its own pose.
+        for (state, by) in own.into_iter().zip(seen.by_pose) {
+            if let Some(shift) = self.shift.get_mut(state) {
+                *shift = -Vector3::from(by).dot(since_prior);
+            }
+        }
     }
 }
 
@@ -558,6 +693,36 @@ pub(crate) struct Weighed {
     pub chi2: f32,
     /// Variance of what it measures over its own, for offset and direction: how much each would tell.
     pub gains: [f32; 2],
+}
+
+impl Weighed {
+    /// Of a measurement with these errors, of numbers that are known with this covariance.
+    fn new(errors: [f32; 2], known: &Matrix2<f32>, measurement: &Measurement) -> Self {
+        let ([var_o, var_d], error) = (measurement.variances, Vector2::from(errors));
+        let covariance = Matrix2::new(known.m11 + var_o, known.m12, known.m12, known.m22 + var_d);
+        Self {
+            chi2: covariance.try_inverse().map_or(f32::INFINITY, |w| error.dot(&(w * error))),
+            gains: [known.m11 / var_o, known.m22 / var_d],
+        }
+    }
+}
+
+/// How far a measurement is believed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Trust {
+    /// One with a larger χ² is not taken in.
+    pub max_chi2: f32,
+    /// Of one with a larger χ² the variances grow with its χ².
+    pub kernel_chi2: f32,
+    /// A number whose gain is smaller is passed over.
+    pub least_gain: f32,
+}
+
+/// A number measured: how much it is off, and how much it may be by all that is known.
+#[derive(Clone, Copy, Debug)]
+struct Number {
+    error: f32,
+    variance: f32,
 }
 
 /// What learns from a measurement. What does not keeps its estimate, and rightly knows less of it.
@@ -572,46 +737,17 @@ pub(crate) enum Learning {
 }
 
 impl Learning {
-    /// How many of the first states learn, and which two besides.
-    fn states(self) -> (usize, [usize; 2]) {
+    fn states(self) -> [Range<usize>; 2] {
+        let line = |place| {
+            let [first, last] = states_of(place);
+            first..last + 1
+        };
         match self {
-            Self::All => (STATES, [0, 1]),
-            Self::RobotAndLine(place) => (FIRST_LINE, states_of(place)),
-            Self::Line(place) => (0, states_of(place)),
+            Self::All => [0..STATES, 0..0],
+            Self::RobotAndLine(place) => [0..FIRST_LINE, line(place)],
+            Self::Line(place) => [0..0, line(place)],
         }
     }
-
-    fn includes(self, state: usize) -> bool {
-        let (first, own) = self.states();
-        state < first || own.contains(&state)
-    }
-}
-
-/// What one number measured says: the covariance of each state with what was measured, and the variance of that, the
-/// measurement's own included.
-struct Innovation {
-    with: [f32; STATES],
-    total: f32,
-}
-
-impl Innovation {
-    fn checked(self) -> Option<Self> {
-        (self.total > 0.0 && self.total.is_finite()).then_some(self)
-    }
-
-    /// What this says beyond what another has told; `row` is this one's.
-    fn after(mut self, other: &Self, row: &Row) -> Option<Self> {
-        let both = along(row, &other.with);
-        let share = both / other.total;
-        self.with.iter_mut().zip(&other.with).for_each(|(own, other)| *own -= share * other);
-        self.total -= share * both;
-        self.checked()
-    }
-}
-
-/// What a row measures of some values of all states.
-fn along(row: &Row, values: &[f32; STATES]) -> f32 {
-    row.iter().map(|&(state, by)| by * values.get(state).copied().unwrap_or(0.0)).sum()
 }
 
 /// Takes so many times each of some vectors, from an index on, from the values. The heart of the joint estimate: four at a time, so
@@ -653,38 +789,27 @@ impl Measurement {
         since_prior: &Vector3<f32>,
         variances: [f32; 2],
     ) -> Self {
-        let [offset, direction] = states_of(place);
         let centroid = seen.moments.centroid;
         let apart = centroid - mapped.moments.centroid;
-        let [mut by_offset, mut by_direction] = pose_rows(mapped.normal(), centroid.coords - prior_position);
-        // Both derivatives hold at most five of eight entries.
-        let _ = by_offset.push((offset, -1.0));
-        let _ = by_offset.push((direction, -mapped.direction.dot(&apart)));
-        let _ = by_direction.push((direction, -1.0));
-        let errors = [mapped.normal().dot(&apart), cross(mapped.direction, seen.direction)];
+        let by_pose = by_pose(mapped.normal(), centroid.coords - prior_position);
+        let [offset, direction] = by_pose.map(|by| Vector3::from(by).dot(since_prior));
         // The error at the prior: that at the pose, less what the way from there has changed.
-        let at_prior = |error: f32, row: &Row| {
-            let way = row.iter().filter(|(state, _)| *state < ODOMETRY);
-            error - way.map(|&(state, by)| by * since_prior.get(state).copied().unwrap_or(0.0)).sum::<f32>()
-        };
-        let error_o = at_prior(errors[0], &by_offset);
-        let error_d = at_prior(errors[1], &by_direction);
-        Self { rows: [(error_o, by_offset), (error_d, by_direction)], variances }
+        let errors =
+            [mapped.normal().dot(&apart) - offset, cross(mapped.direction, seen.direction) - direction];
+        let by_line = [[-1.0, -mapped.direction.dot(&apart)], [0.0, -1.0]];
+        let by_lines = heapless::Vec::from_slice(&[(place, by_line)]).unwrap_or_default();
+        Self { errors, variances, by: Derivative { by_pose, by_lines } }
     }
 
     /// Two map segments that are one wall.
     pub(crate) fn of_twins(kept: (&Segment, usize), gone: (&Segment, usize), variances: [f32; 2]) -> Self {
         let ((a, place_a), (b, place_b)) = (kept, gone);
-        let ([offset_a, direction_a], [offset_b, direction_b]) = (states_of(place_a), states_of(place_b));
         let apart = b.moments.centroid - a.moments.centroid;
         let along = a.along_of(b.moments.centroid);
-        let by_offset = Row::from_slice(&[(offset_b, 1.0), (offset_a, -1.0), (direction_a, -along)]);
-        let by_direction = Row::from_slice(&[(direction_b, 1.0), (direction_a, -1.0)]);
+        let by_lines = [(place_a, [[-1.0, -along], [0.0, -1.0]]), (place_b, [[1.0, 0.0], [0.0, 1.0]])];
+        let by_lines = heapless::Vec::from_slice(&by_lines).unwrap_or_default();
         let errors = [a.normal().dot(&apart), cross(a.direction, b.direction)];
-        Self {
-            rows: [(errors[0], by_offset.unwrap_or_default()), (errors[1], by_direction.unwrap_or_default())],
-            variances,
-        }
+        Self { errors, variances, by: Derivative { by_pose: [[0.0; 3]; 2], by_lines } }
     }
 }
 
@@ -709,11 +834,8 @@ pub(crate) fn with_variances(segment: &Segment, var_offset: f32, var_direction: 
 }
 
 /// Derivatives of a line's offset, at a point this far from the robot, and of its direction by the pose it is seen from.
-fn pose_rows(normal: Vector2<f32>, from_robot: Vector2<f32>) -> [Row; 2] {
-    let lever = normal.dot(&perpendicular(from_robot));
-    let by_offset = [(POSE, normal.x), (POSE + 1, normal.y), (POSE + 2, lever)];
-    let by_direction = [(POSE + 2, 1.0)];
-    [Row::from_slice(&by_offset).unwrap_or_default(), Row::from_slice(&by_direction).unwrap_or_default()]
+fn by_pose(normal: Vector2<f32>, from_robot: Vector2<f32>) -> [[f32; 3]; 2] {
+    [[normal.x, normal.y, normal.dot(&perpendicular(from_robot))], [0.0, 0.0, 1.0]]
 }
 
 #[cfg(test)]
@@ -733,6 +855,7 @@ mod tests {
         sigma_heading_floor_rad: 0.001,
     };
     const SEEN: [f32; 2] = [1e-4, 4e-4];
+    const PLAIN: Trust = Trust { max_chi2: f32::INFINITY, kernel_chi2: f32::INFINITY, least_gain: 0.0 };
 
     struct Gauss(rand_pcg::Pcg32);
 
@@ -820,12 +943,12 @@ mod tests {
                 let position = self.believed.translation.vector;
                 let measurement =
                     Measurement::of_pair(place, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
-                self.joint.measure(&measurement, 1.0, [true; 2], Learning::All);
+                self.joint.measure(&measurement, &PLAIN, Learning::All);
             }
             self.believed = self.joint.settle(&self.believed, &mut self.map);
             for (i, in_base) in new {
                 let index = self.map.insert(in_base.transformed(&self.believed), self.scan, 0.0).unwrap();
-                self.joint.add(index, self.believed.translation.vector, &mut self.map);
+                self.joint.add(index, self.believed.translation.vector, &Vector3::zeros(), &mut self.map);
                 self.known[i] = Some(index);
             }
         }
@@ -894,12 +1017,56 @@ mod tests {
         let position = world.believed.translation.vector;
         let measurement =
             Measurement::of_pair(place, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
-        world.joint.measure(&measurement, 1.0, [true; 2], Learning::Line(place));
+        world.joint.measure(&measurement, &PLAIN, Learning::Line(place));
         assert_eq!(world.joint.pose_covariance(), before.pose_covariance());
         let same = world.joint.settle(&world.believed, &mut world.map);
         assert_eq!(components(&same), components(&world.believed));
         let moved = world.map.segments()[0].segment.midpoint() - entry.segment.midpoint();
         assert!(moved.norm() > 0.01, "{moved}");
+    }
+
+    #[test]
+    fn what_is_weighed_is_what_is_measured() {
+        let mut world = World::new(6);
+        world.look();
+        (0..30).for_each(|_| world.step(0.1, Vector3::zeros()));
+        let position = world.believed.translation.vector;
+        for index in 0..world.map.segments().len() {
+            let entry = world.map.segments()[index];
+            let Some(place) = world.joint.place_of(index) else { continue };
+            let seen = entry.segment.shifted(0.02, 0.01);
+            let measurement =
+                Measurement::of_pair(place, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
+            let weighed = world.joint.weigh(&measurement);
+            let with = world.joint.covariance_with(&measurement.by);
+            for (state, [o, d]) in (0..STATES).map(|state| (state, [with[0][state], with[1][state]])) {
+                let plain = measurement.by.entries().fold([0.0; 2], |sums, (i, [by_o, by_d])| {
+                    let value = world.joint.get(state, i);
+                    [sums[0] + by_o * value, sums[1] + by_d * value]
+                });
+                assert!((o - plain[0]).abs() < 1e-6 && (d - plain[1]).abs() < 1e-6, "{state} of {index}");
+            }
+            let [known_o, _] = measurement.by.times(&with[0]);
+            let [_, known_d] = measurement.by.times(&with[1]);
+            for (gain, known) in weighed.gains.iter().zip([known_o / SEEN[0], known_d / SEEN[1]]) {
+                assert!((gain - known).abs() < 1e-2 * (1.0 + known), "{gain} {known} of {index}");
+            }
+            let least = |max_chi2| Trust { max_chi2, ..PLAIN };
+            let mut doubting = world.joint.clone();
+            assert!(!doubting.measure(&measurement, &least(0.99 * weighed.chi2), Learning::All));
+            assert!(doubting.measure(&measurement, &least(1.01 * weighed.chi2), Learning::All));
+        }
+    }
+
+    /// The map has dropped a segment for a new one, at the same index.
+    #[test]
+    fn a_new_segment_does_not_inherit_what_was_known_of_another() {
+        let mut world = World::new(2);
+        world.look();
+        let known = world.joint.owners.iter().flatten().count();
+        world.joint.add(0, Vector2::zeros(), &Vector3::zeros(), &mut world.map);
+        assert_eq!(world.joint.owners.iter().filter(|owner| **owner == Some(0)).count(), 1);
+        assert_eq!(world.joint.owners.iter().flatten().count(), known);
     }
 
     #[test]

@@ -3,9 +3,10 @@
 //! Scans taken from nearly the same place share errors: corners cut alike, edges mixed alike. Taking in each of them would
 //! make the map sure of what they have in common, and would cost the most work where there is least to learn. So the joint
 //! estimate takes in a scan when the robot has moved on since the last one it took in, and now and then while it stands.
-//! The pose of every other scan is corrected against the map as the last keyframe left it.
+//! The pose of every other scan is corrected against the map as the last keyframe left it, by fewer beams; and while the robot goes on, what the
+//! keyframe saw is taken in bit by bit, so that no scan takes long.
 
-use nalgebra::{Isometry2, Matrix3};
+use nalgebra::{Isometry2, Matrix3, Vector2};
 
 use crate::odometry::Increment;
 use crate::pose::perpendicular;
@@ -49,13 +50,24 @@ impl Keyframe {
             || self.scans >= config.scans
             || self.since.distance_m + self.since.turn_rad >= config.way_m
     }
+}
 
-    /// Covariance of a pose that lies firmly with the keyframe's, whose covariance is given.
-    pub fn carried(&self, covariance: &Matrix3<f32>, map_from_base: &Isometry2<f32>) -> Matrix3<f32> {
-        let lever = perpendicular(map_from_base.translation.vector - self.map_from_base.translation.vector);
+/// Where the joint estimate last stood with nothing left to be taken in.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Settled {
+    /// Of `base` in `map`.
+    pub position: Vector2<f32>,
+    /// Of the pose (x, y, θ).
+    pub covariance: Matrix3<f32>,
+}
+
+impl Settled {
+    /// Covariance of a pose that lies firmly with that one.
+    pub fn carried(&self, map_from_base: &Isometry2<f32>) -> Matrix3<f32> {
+        let lever = perpendicular(map_from_base.translation.vector - self.position);
         let mut by_pose = Matrix3::identity();
         (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
-        by_pose * covariance * by_pose.transpose()
+        by_pose * self.covariance * by_pose.transpose()
     }
 }
 
@@ -85,10 +97,10 @@ mod tests {
     }
 
     #[test]
-    fn away_from_the_keyframe_its_heading_s_error_moves_the_robot() {
-        let keyframe = Keyframe::at(pose(1.0, 1.0, 0.3));
+    fn away_from_where_it_settled_the_heading_s_error_moves_the_robot() {
         let covariance = Matrix3::from_diagonal(&nalgebra::Vector3::new(1e-4, 1e-4, 4e-4));
-        let carried = keyframe.carried(&covariance, &pose(3.0, 1.0, 0.0));
+        let settled = Settled { position: Vector2::new(1.0, 1.0), covariance };
+        let carried = settled.carried(&pose(3.0, 1.0, 0.0));
         assert!((carried.m22 - (1e-4 + 4.0 * 4e-4)).abs() < 1e-8 && (carried.m11 - 1e-4).abs() < 1e-8);
         assert!((carried.m23 - 2.0 * 4e-4).abs() < 1e-8);
     }

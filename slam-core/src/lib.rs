@@ -13,8 +13,8 @@
 //!                             └───── pose, odometry's errors ◄───────┘ loop closure
 //! ```
 //!
-//! The correction finds which segment is which, and a pose good enough to make everything linear. The joint estimate
-//! then has the last word on the pose, on the odometry's errors and on the lines.
+//! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are [`keyframe`]s the
+//! joint estimate then has the last word on the pose, on the odometry's errors and on the lines, a few scans later.
 //!
 //! [`Slam::process_scan`](slam::Slam::process_scan) is that drawing; each stage is a module of its own and can be used
 //! without it.

@@ -7,18 +7,21 @@
 //! [`Joint`] estimate, which moves pose and lines together, and fuses map segments that turn out to be one wall.
 
 use heapless::Vec;
-use nalgebra::{Isometry2, Point2};
+use nalgebra::{Isometry2, Point2, Vector3};
 
 use crate::association::Pair;
 use crate::extraction::MAX_SEGMENTS;
-use crate::joint::{Joint, Learning, Measurement, Weighed, variances, with_variances};
+use crate::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
 use crate::keyframe::KeyframeConfig;
 use crate::map::{MapSegment, SegmentMap};
 use crate::math::wrap_angle;
 use crate::nearby::Nearby;
-use crate::pose::{components, cross};
+use crate::pose::{components, cross, is_finite};
 use crate::residual::{LineNoise, Residual};
 use crate::segment::{Moments, Segment};
+
+/// Most sightings of a keyframe that are taken in.
+pub const MAX_TAKEN: usize = 12;
 
 /// How segments enter the map.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,10 +41,13 @@ pub enum RegistrationConfig {
 pub struct JointConfig {
     /// Which scans are taken in.
     pub keyframes: KeyframeConfig,
-    /// Most sightings that are taken in of a scan, those that tell most.
+    /// Most sightings that are taken in of a keyframe, those that tell most; no more than [`MAX_TAKEN`].
     pub max_taken: u8,
     /// Most of those from which everything learns; from the others only the robot and the line that was seen.
     pub max_learning: u8,
+    /// Most sightings that are taken in during one scan, so that none takes long. They begin with the scan after the keyframe; where
+    /// keyframes follow each other, all are taken in at once.
+    pub taken_per_scan: u8,
     /// A number that would tell less than this is passed over: variance of what it measures, over its own.
     pub least_gain: f32,
     /// A pair that fits worse than this χ² changes nothing.
@@ -70,6 +76,12 @@ pub struct JointConfig {
     pub fuse_overlap: f32,
 }
 
+impl JointConfig {
+    fn trust(&self) -> Trust {
+        Trust { max_chi2: self.max_chi2, kernel_chi2: self.kernel_chi2, least_gain: self.least_gain }
+    }
+}
+
 /// When a scan was taken.
 #[derive(Clone, Copy, Debug)]
 pub struct Stamp {
@@ -91,6 +103,8 @@ pub struct RegistrationReport {
     pub doubtful: u32,
     /// Whether the scan was taken into the map; the default takes in keyframes only.
     pub keyframe: bool,
+    /// Whether the last keyframe was taken in wholly: the map and with it the pose have moved.
+    pub settled: bool,
 }
 
 /// What the registration is given of a scan.
@@ -102,10 +116,17 @@ pub struct Observed<'a> {
     pub pairs: &'a [Pair],
     /// When they were seen.
     pub stamp: Stamp,
-    /// How far the sensor sees, metres.
+    /// What saw them.
+    pub eye: Eye,
+}
+
+/// What the registration must know of the sensor.
+#[derive(Clone, Copy, Debug)]
+pub struct Eye {
+    /// How far it sees, metres.
     pub reach_m: f32,
     /// Errors of lines beyond their points' noise.
-    pub line_noise: &'a LineNoise,
+    pub line_noise: LineNoise,
 }
 
 impl Observed<'_> {
@@ -124,7 +145,7 @@ pub fn register_end_points<const N: usize>(
     pose: &Isometry2<f32>,
     map: &mut SegmentMap<N>,
 ) -> RegistrationReport {
-    let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
+    let mut report = RegistrationReport { keyframe: true, settled: true, ..RegistrationReport::default() };
     for pair in seen.pairs {
         let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
         else {
@@ -163,112 +184,173 @@ pub struct Start<'a> {
     pub pose: &'a Isometry2<f32>,
 }
 
-/// Joint estimate of the pose, the odometry's errors and the lines, from the pairs of a scan; what is not known is added.
-/// Returns the pose, and in `near` the map segments around it.
-///
-/// Work: for each sighting from which everything learns, the square of the number of states tracked, for the others that
-/// number; for fusing, one step for each map segment that was
-/// seen and each one around the robot, and one for each map segment.
-pub fn register_jointly<const N: usize>(
-    seen: &Observed<'_>,
-    start: &Start<'_>,
-    config: &JointConfig,
-    joint: &mut Joint,
-    map: &mut SegmentMap<N>,
-    near: &mut Nearby<N>,
-) -> (Isometry2<f32>, RegistrationReport) {
-    let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
-    let mut sightings: Vec<Sighting, MAX_SEGMENTS> = Vec::new();
-    for &pair in seen.pairs {
-        // As many pairs as observed segments at most.
-        match Sighting::new(pair, seen, start, joint, map) {
-            Some(sighting) => drop(sightings.push(sighting)),
-            None => report.doubtful += 1,
-        }
+impl Start<'_> {
+    /// From the prior's (x, y, θ) to the pose's.
+    fn since_prior(&self) -> Vector3<f32> {
+        let mut since = components(self.pose) - components(self.prior);
+        since.z = wrap_angle(since.z);
+        since
     }
-    for index in 0..sightings.len() {
-        let rank = rank(&sightings, index);
-        let Some(sighting) = sightings.get_mut(index) else { break };
-        let Some(measurement) = sighting.pair.measurement(sighting.place, seen, start, map) else { continue };
-        let Weighed { chi2, gains } = joint.weigh(&measurement);
-        sighting.fits = chi2 <= config.max_chi2;
-        let Some(entry) = map.get_mut(sighting.pair.mapped).filter(|_| sighting.fits) else {
-            report.doubtful += 1;
-            continue;
-        };
-        let doubted = entry.hits < config.young_hits
-            && joint.age_scans(sighting.place) > config.young_scans_per_hit * f32::from(entry.hits);
-        let learning = match sighting.place {
-            place if doubted => Some(Learning::Line(place)),
-            _ if rank < usize::from(config.max_learning) => Some(Learning::All),
-            place if rank < usize::from(config.max_taken) => Some(Learning::RobotAndLine(place)),
-            _ => None,
-        };
-        if let Some(learning) = learning {
-            let factor = (chi2 / config.kernel_chi2).max(1.0);
-            joint.measure(&measurement, factor, gains.map(|gain| gain >= config.least_gain), learning);
-        }
-        mark_seen(entry, &seen.stamp);
-        report.matched += 1;
-    }
-    let mut pose = joint.settle(start.prior, map);
-    for Sighting { pair, .. } in sightings.iter().filter(|s| s.fits) {
-        let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
-        else {
-            continue;
-        };
-        let moments = &mut entry.segment.moments;
-        moments.inliers = moments.inliers.saturating_add(segment.moments.inliers);
-        let longer = entry.segment.extended([pose * segment.start, pose * segment.end]);
-        if longer.is_finite() {
-            entry.segment = longer;
-        }
-    }
-    for segment in seen.unknown() {
-        let [var_offset, var_direction] =
-            with_line_noise(variances(segment), seen.line_noise, segment.length_m());
-        let segment = with_variances(&segment.transformed(&pose), var_offset, var_direction);
-        if segment.is_finite()
-            && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
-        {
-            joint.add(index, pose.translation.vector, map);
-            report.new += 1;
-        }
-    }
-    fuse_walls(seen, config, &mut pose, joint, map, near);
-    (pose, report)
 }
 
-/// A map segment seen again, for the joint estimate.
+/// The sightings of a keyframe on their way into the joint estimate of the pose, the odometry's errors and the lines.
+///
+/// The estimate stays at the keyframe until all are taken in, and the map as it was; then pose and lines move at once. What is
+/// new enters the map with the keyframe.
+#[derive(Clone, Debug, Default)]
+pub struct Sightings {
+    /// In the order of the scan.
+    list: Vec<Sighting, MAX_TAKEN>,
+    /// How many of them have been taken in.
+    taken: usize,
+    /// Where they were made from, until they are settled.
+    made: Option<Made>,
+}
+
+/// Where sightings were made from.
+#[derive(Clone, Copy, Debug)]
+struct Made {
+    /// The predicted pose, which the joint estimate has.
+    prior: Isometry2<f32>,
+    /// The pose through which the pairs were found.
+    pose: Isometry2<f32>,
+    /// Number of the scan.
+    scan: u32,
+}
+
+/// A map segment seen again.
+#[derive(Clone, Debug)]
 struct Sighting {
-    pair: Pair,
+    measurement: Measurement,
     /// Of the map segment among the lines tracked.
     place: usize,
-    /// What it would tell before anything of this scan is taken in, both [`Weighed::gains`] added.
-    gain: f32,
-    /// Whether it agrees with what has been measured before it.
-    fits: bool,
+    learning: Learning,
 }
 
-impl Sighting {
-    fn new<const N: usize>(
-        pair: Pair,
+impl Sightings {
+    /// Whether there are any that have not been settled.
+    pub fn wait(&self) -> bool {
+        self.made.is_some()
+    }
+
+    /// Drops them.
+    pub fn clear(&mut self) {
+        self.list.clear();
+        (self.taken, self.made) = (0, None);
+    }
+
+    /// Makes the sightings of a keyframe, and adds to the map what is not known.
+    ///
+    /// Work: for each pair some steps, and one for each other pair; for each new segment the number of states tracked.
+    pub fn make<const N: usize>(
+        &mut self,
         seen: &Observed<'_>,
         start: &Start<'_>,
+        config: &JointConfig,
         joint: &mut Joint,
         map: &mut SegmentMap<N>,
-    ) -> Option<Self> {
-        let place = joint.track(pair.mapped, map)?;
-        let gain = joint.weigh(&pair.measurement(place, seen, start, map)?).gains.iter().sum();
-        Some(Self { pair, place, gain, fits: false })
+    ) -> RegistrationReport {
+        self.clear();
+        self.made = Some(Made { prior: *start.prior, pose: *start.pose, scan: seen.stamp.scan });
+        let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
+        // What each would tell; nothing where it does not fit. As many pairs as observed segments at most.
+        let mut gains: Vec<Option<f32>, MAX_SEGMENTS> = Vec::new();
+        for pair in seen.pairs {
+            let gain = joint.track(pair.mapped, map).and_then(|place| {
+                let weighed = joint.weigh(&pair.measurement(place, seen, start, map)?);
+                (weighed.chi2 <= config.max_chi2).then(|| weighed.gains.iter().sum())
+            });
+            let _ = gains.push(gain);
+        }
+        for (index, pair) in seen.pairs.iter().enumerate() {
+            let (Some(rank), Some(place)) = (rank(&gains, index), joint.place_of(pair.mapped)) else {
+                report.doubtful += 1;
+                continue;
+            };
+            if rank < usize::from(config.max_taken)
+                && let Some(measurement) = pair.measurement(place, seen, start, map)
+                && let Some(entry) = map.segments().get(pair.mapped)
+            {
+                let doubted = entry.hits < config.young_hits
+                    && joint.age_scans(place) > config.young_scans_per_hit * f32::from(entry.hits);
+                let learning = match place {
+                    place if doubted => Learning::Line(place),
+                    _ if rank < usize::from(config.max_learning) => Learning::All,
+                    place => Learning::RobotAndLine(place),
+                };
+                // There is room for as many as may be taken.
+                let _ = self.list.push(Sighting { measurement, place, learning });
+            }
+            if let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
+            {
+                mark_seen(entry, &seen.stamp);
+                let moments = &mut entry.segment.moments;
+                moments.inliers = moments.inliers.saturating_add(segment.moments.inliers);
+                let longer = entry.segment.extended([start.pose * segment.start, start.pose * segment.end]);
+                if longer.is_finite() {
+                    entry.segment = longer;
+                }
+            }
+            report.matched += 1;
+        }
+        for segment in seen.unknown() {
+            let [var_offset, var_direction] =
+                with_line_noise(variances(segment), &seen.eye.line_noise, segment.length_m());
+            let segment = with_variances(&segment.transformed(start.pose), var_offset, var_direction);
+            if segment.is_finite()
+                && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
+            {
+                joint.add(index, start.prior.translation.vector, &start.since_prior(), map);
+                report.new += 1;
+            }
+        }
+        report
+    }
+
+    /// Takes in so many of them; false where none was left.
+    ///
+    /// Work: for each from which everything learns the square of the number of states tracked, for the others that number.
+    pub fn take_in(&mut self, most: usize, config: &JointConfig, joint: &mut Joint) -> bool {
+        let trust = config.trust();
+        let begin = self.taken;
+        for sighting in self.list.iter().skip(begin).take(most) {
+            self.taken += 1;
+            // A line that has been forgotten since is no more.
+            if joint.tracks(sighting.place) {
+                joint.measure(&sighting.measurement, &trust, sighting.learning);
+            }
+        }
+        self.taken > begin
+    }
+
+    /// Takes in what is left, moves pose and lines, and fuses walls. Returns the keyframe's pose as it was thought to be, and as it is; in
+    /// `near` the map segments around it. `None` where there is nothing to settle.
+    ///
+    /// Work: for the lines tracked one step each; for fusing, one step for each map segment that was seen and each one
+    /// around the robot, and one for each map segment.
+    pub fn settle<const N: usize>(
+        &mut self,
+        eye: &Eye,
+        config: &JointConfig,
+        joint: &mut Joint,
+        map: &mut SegmentMap<N>,
+        near: &mut Nearby<N>,
+    ) -> Option<[Isometry2<f32>; 2]> {
+        self.take_in(MAX_TAKEN, config, joint);
+        let Made { prior, pose, scan } = self.made.take()?;
+        let mut settled = joint.settle(&prior, map);
+        fuse_walls(scan, eye, config, &mut settled, joint, map, near);
+        Some([pose, if is_finite(&settled) { settled } else { pose }])
     }
 }
 
-/// How many sightings tell more than one of them. Taken in in that order, those that are least known, and may be wrong, would
-/// come first: the order stays that of the scan.
-fn rank(sightings: &[Sighting], index: usize) -> usize {
-    let gain = sightings.get(index).map_or(0.0, |s| s.gain);
-    sightings.iter().enumerate().filter(|(i, s)| s.gain > gain || s.gain == gain && *i < index).count()
+/// How many pairs tell more than one of them, which must tell something. Taken in in that order, those that are least known, and may be
+/// wrong, would come first: the order stays that of the scan.
+fn rank(gains: &[Option<f32>], index: usize) -> Option<usize> {
+    let gain = gains.get(index).copied().flatten()?;
+    let more =
+        |(i, other): &(usize, &Option<f32>)| other.is_some_and(|o| o > gain || o == gain && *i < index);
+    Some(gains.iter().enumerate().filter(more).count())
 }
 
 impl Pair {
@@ -283,12 +365,10 @@ impl Pair {
         let segment = seen.segments.get(self.observed)?;
         let mapped = &map.segments().get(self.mapped)?.segment;
         let length_m = segment.length_m().min(mapped.length_m());
-        let variances = with_line_noise(variances(segment), seen.line_noise, length_m);
+        let variances = with_line_noise(variances(segment), &seen.eye.line_noise, length_m);
         let segment = segment.transformed(start.pose);
         let position = start.prior.translation.vector;
-        let mut since_prior = components(start.pose) - components(start.prior);
-        since_prior.z = wrap_angle(since_prior.z);
-        Some(Measurement::of_pair(place, mapped, &segment, position, &since_prior, variances))
+        Some(Measurement::of_pair(place, mapped, &segment, position, &start.since_prior(), variances))
     }
 }
 
@@ -307,27 +387,28 @@ fn joined_by_end_points(mapped: &Segment, seen: &Segment) -> Segment {
     Segment::fitted(moments, &ends, mapped.midpoint() + mapped.normal())
 }
 
-/// Fuses each map segment that this scan changed with those that are the same wall. Leaves the segments around the robot in
+/// Fuses each map segment that a scan saw with those that are the same wall. Leaves the segments around the robot in
 /// `near`.
 fn fuse_walls<const N: usize>(
-    seen: &Observed<'_>,
+    scan: u32,
+    eye: &Eye,
     config: &JointConfig,
     pose: &mut Isometry2<f32>,
     joint: &mut Joint,
     map: &mut SegmentMap<N>,
     near: &mut Nearby<N>,
 ) {
-    near.gather(map.segments(), pose, seen.reach_m, |_| true);
+    near.gather(map.segments(), pose, eye.reach_m, |_| true);
     let mut next = 0;
     while let Some(index) = near.all().get(next).copied().map(usize::from) {
         let Some(changed) = map.segments().get(index).copied() else { break };
         let is_twin = |other: &usize| {
             *other != index
                 && map.segments().get(*other).is_some_and(|s| {
-                    one_wall(&changed, s, &pose.translation.vector.into(), seen.line_noise, config)
+                    one_wall(&changed, s, &pose.translation.vector.into(), &eye.line_noise, config)
                 })
         };
-        let twin = (changed.last_seen == seen.stamp.scan)
+        let twin = (changed.last_seen == scan)
             .then(|| {
                 near.along(changed.segment.direction, config.fuse_max_angle_rad)
                     .map(usize::from)
@@ -340,7 +421,7 @@ fn fuse_walls<const N: usize>(
         };
         let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment.moments.inliers);
         let (kept, gone) = if inliers(twin) > inliers(index) { (twin, index) } else { (index, twin) };
-        if let Some(settled) = agree([kept, gone], seen, config, pose, joint, map) {
+        if let Some(settled) = agree([kept, gone], eye, config, pose, joint, map) {
             *pose = settled;
         }
         map.fuse(kept, gone);
@@ -348,7 +429,7 @@ fn fuse_walls<const N: usize>(
         joint.removed(gone, last, map);
         // The grown segment is looked at again, wherever it went.
         let grown = if kept == last { gone } else { kept };
-        near.gather(map.segments(), pose, seen.reach_m, |_| true);
+        near.gather(map.segments(), pose, eye.reach_m, |_| true);
         let all = near.all();
         next = all.iter().position(|i| usize::from(*i) >= grown).unwrap_or(all.len());
     }
@@ -357,7 +438,7 @@ fn fuse_walls<const N: usize>(
 /// Measures that two map segments are one line, unless they disagree. Returns the pose by that.
 fn agree<const N: usize>(
     twins: [usize; 2],
-    seen: &Observed<'_>,
+    eye: &Eye,
     config: &JointConfig,
     pose: &Isometry2<f32>,
     joint: &mut Joint,
@@ -367,12 +448,10 @@ fn agree<const N: usize>(
     let [a, b] = twins.map(|index| map.segments().get(index).map(|s| s.segment));
     let (a, b) = (a?, b?);
     let length_m = a.length_m().min(b.length_m());
-    let variances = with_line_noise([0.0, 0.0], seen.line_noise, length_m);
+    let variances = with_line_noise([0.0, 0.0], &eye.line_noise, length_m);
     let measurement = Measurement::of_twins((&a, kept?), (&b, gone?), variances);
-    (joint.weigh(&measurement).chi2 <= config.fuse_chi2).then(|| {
-        joint.measure(&measurement, 1.0, [true; 2], Learning::All);
-        joint.settle(pose, map)
-    })
+    let trust = Trust { max_chi2: config.fuse_chi2, kernel_chi2: f32::INFINITY, least_gain: 0.0 };
+    joint.measure(&measurement, &trust, Learning::All).then(|| joint.settle(pose, map))
 }
 
 /// Whether two map segments are one wall: either they agree within their uncertainty, or they lie so close behind each
@@ -421,6 +500,7 @@ mod tests {
     use std::vec::Vec as StdVec;
 
     const NOISE: LineNoise = LineNoise { sigma_offset_m: 0.005, sigma_direction_rad: 0.002 };
+    const EYE: Eye = Eye { reach_m: 5.6, line_noise: NOISE };
 
     fn wall(from: (f32, f32), to: (f32, f32)) -> Segment {
         let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
@@ -437,7 +517,7 @@ mod tests {
     }
 
     fn observed<'a>(segments: &'a [Segment], pairs: &'a [Pair], scan: u32) -> Observed<'a> {
-        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, line_noise: &NOISE, reach_m: 5.6 }
+        Observed { segments, pairs, stamp: Stamp { scan, way_m: 1.0 }, eye: EYE }
     }
 
     /// A robot that stands at the origin and is sure of it.
@@ -450,8 +530,10 @@ mod tests {
     ) -> RegistrationReport {
         let here = pose(0.0, 0.0, 0.0);
         let start = Start { prior: &here, pose: &here };
-        let mut near = Nearby::new();
-        register_jointly(&observed(segments, pairs, scan), &start, &config(), joint, map, &mut near).1
+        let mut sightings = Sightings::default();
+        let report = sightings.make(&observed(segments, pairs, scan), &start, &config(), joint, map);
+        sightings.settle(&EYE, &config(), joint, map, &mut Nearby::new()).unwrap();
+        report
     }
 
     fn joint() -> Joint {
@@ -509,6 +591,88 @@ mod tests {
         assert_eq!(lengths.len(), 2);
         assert!((lengths[1] - 3.5).abs() < 1e-3);
         assert_eq!(map.counters().fused, 1);
+    }
+
+    /// A robot that has moved, unsure by centimetres, and sees four walls it knows, and one it does not.
+    struct Keyframe {
+        map: SegmentMap<8>,
+        joint: Joint,
+        sightings: Sightings,
+    }
+
+    impl Keyframe {
+        /// The robot is at `truth`, believes in the origin, and has found `tracked`.
+        fn new(truth: f32, tracked: f32) -> Self {
+            let (mut map, mut joint) = (SegmentMap::new(), joint());
+            let known = [
+                wall((3.0, -2.0), (3.0, 2.0)),
+                wall((-3.0, 2.0), (3.0, 2.0)),
+                wall((-3.0, -2.0), (-3.0, 2.0)),
+                wall((-3.0, -2.0), (3.0, -2.0)),
+            ];
+            run(&mut map, &mut joint, &known, &[], 1);
+            joint.loosen_pose(&(Matrix3::identity() * 1e-3), &mut map);
+            let base_from_map = pose(truth, 0.0, 0.0).inverse();
+            let mut seen: StdVec<Segment> = known.iter().map(|s| s.transformed(&base_from_map)).collect();
+            let unknown = wall((2.0, -1.0), (2.0, -0.5));
+            seen.push(unknown.transformed(&base_from_map));
+            let pairs: StdVec<Pair> = (0..4).map(|i| Pair { observed: i, mapped: i }).collect();
+            let (prior, pose) = (pose(0.0, 0.0, 0.0), pose(tracked, 0.0, 0.0));
+            let mut sightings = Sightings::default();
+            let start = Start { prior: &prior, pose: &pose };
+            let report = sightings.make(&observed(&seen, &pairs, 2), &start, &config(), &mut joint, &mut map);
+            assert_eq!((report.matched, report.new, report.settled), (4, 1, false));
+            Self { map, joint, sightings }
+        }
+
+        fn settle(&mut self) -> Isometry2<f32> {
+            let (map, joint) = (&mut self.map, &mut self.joint);
+            let [_, settled] =
+                self.sightings.settle(&EYE, &config(), joint, map, &mut Nearby::new()).unwrap();
+            settled
+        }
+    }
+
+    #[test]
+    fn sightings_taken_in_one_by_one_are_those_taken_in_at_once() {
+        let (mut slowly, mut at_once) = (Keyframe::new(0.03, 0.02), Keyframe::new(0.03, 0.02));
+        let before = slowly.map.segments().to_vec();
+        let mut scans = 0;
+        while slowly.sightings.take_in(1, &config(), &mut slowly.joint) {
+            scans += 1;
+            assert_eq!(slowly.map.segments(), &*before, "the map stays as it was until they are settled");
+            assert!(slowly.sightings.wait());
+        }
+        assert_eq!(scans, 4);
+        assert_eq!(components(&slowly.settle()), components(&at_once.settle()));
+        assert_eq!(slowly.map.segments(), at_once.map.segments());
+        assert_eq!(slowly.joint.pose_covariance(), at_once.joint.pose_covariance());
+        assert!(!slowly.sightings.wait() && slowly.map.segments() != before);
+    }
+
+    /// Wherever the pose was thought to be when a wall was added, it is where the robot saw it from the pose that is settled.
+    #[test]
+    fn what_is_new_lies_as_it_was_seen() {
+        for tracked in [0.0, 0.02, 0.03, 0.05] {
+            let mut keyframe = Keyframe::new(0.03, tracked);
+            let settled = keyframe.settle();
+            assert!((settled.translation.vector.x - 0.03).abs() < 2e-3, "{tracked}: {settled}");
+            let new = keyframe.map.segments()[4].segment.transformed(&settled.inverse());
+            assert!((new.midpoint().x - 1.97).abs() < 1e-3, "{tracked}: {new:?}");
+        }
+    }
+
+    #[test]
+    fn a_line_forgotten_before_it_is_taken_in_says_nothing() {
+        let (mut whole, mut less) = (Keyframe::new(0.03, 0.03), Keyframe::new(0.03, 0.03));
+        // Of the only walls that tell how far ahead the robot is.
+        for index in [2, 0] {
+            less.map.forget(index);
+            let last = less.map.segments().len();
+            less.joint.removed(index, last, &mut less.map);
+        }
+        assert!((whole.settle().translation.vector.x - 0.03).abs() < 2e-3);
+        assert!(less.settle().translation.vector.x.abs() < 2e-3);
     }
 
     fn registered(walls: &[Segment]) -> SegmentMap<8> {

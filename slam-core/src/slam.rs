@@ -14,7 +14,7 @@ use crate::correction::{
 use crate::deskew::{DeskewReport, ScanPoint, deskew};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
-use crate::keyframe::Keyframe;
+use crate::keyframe::{Keyframe, Settled};
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, MapSegment, SegmentMap};
 use crate::math::{sqrt, within, wrap_angle};
@@ -24,7 +24,7 @@ use crate::odometry_bias::OdometryBias;
 use crate::odometry_track::ScanMotion;
 use crate::pose::{components, is_finite, perpendicular, pose, rotate_covariance};
 use crate::registration::{
-    Observed, RegistrationConfig, RegistrationReport, Stamp, Start, register_end_points, register_jointly,
+    Eye, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start, register_end_points,
 };
 use crate::scan::Scan;
 use crate::segment::Segment;
@@ -32,7 +32,7 @@ use crate::visibility::{is_gone, mark_seen_through};
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///
-/// RAM: [`Slam::BYTES`], about 68 bytes for each map segment, 16 for each beam and 28 KiB.
+/// RAM: [`Slam::BYTES`], about 68 bytes for each map segment, 16 for each beam and 30 KiB.
 pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     config: SlamConfig,
     map: SegmentMap<N>,
@@ -44,6 +44,9 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     closing: PendingClosure,
     joint: Option<Joint>,
     keyframe: Keyframe,
+    sightings: Sightings,
+    /// Where the joint estimate last took in a keyframe wholly, and how sure it was of the pose then.
+    settled: Settled,
     points: Vec<ScanPoint, BEAMS>,
     observed: Vec<Segment, MAX_SEGMENTS>,
     pairs: Vec<Pair, MAX_SEGMENTS>,
@@ -200,6 +203,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             closing: PendingClosure::default(),
             joint: None,
             keyframe: Keyframe::at(Isometry2::identity()),
+            sightings: Sightings::default(),
+            settled: Settled::default(),
             points: Vec::new(),
             observed: Vec::new(),
             pairs: Vec::new(),
@@ -233,10 +238,16 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     /// Covariance of the pose (x, y, θ), in `map`.
     pub fn covariance(&self) -> Matrix3<f32> {
-        let Some(joint) = &self.joint else { return self.local_covariance };
-        let carried = self.keyframe.carried(&joint.pose_covariance(), &self.map_from_base);
-        // The keyframe's own pose is the joint estimate's; another has an error of its own among the lines around it.
-        if self.keyframe.scans == 0 { carried } else { carried + self.local_covariance }
+        if self.joint.is_none() {
+            return self.local_covariance;
+        }
+        let carried = self.settled.carried(&self.map_from_base);
+        // The pose of a keyframe taken in is the joint estimate's; another has an error of its own among the lines around it.
+        if self.keyframe.scans == 0 && !self.sightings.wait() {
+            carried
+        } else {
+            carried + self.local_covariance
+        }
     }
 
     /// Systematic errors of the odometry as learnt so far.
@@ -301,7 +312,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
                 self.close_loop(&config, &mut update, watch);
             }
             watch(Stage::Registration);
-            self.extend_map(&mut update);
+            update.residual_m = self.residual_m(&update.pose);
+            self.register(&mut update);
             if update.registration.keyframe {
                 self.forget(scan, &update);
             }
@@ -323,6 +335,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.counters.coasted = self.counters.coasted.saturating_add(1);
         if self.keyframe_is_due() {
             self.advance_joint();
+            self.note_settled();
         }
         prior.pose
     }
@@ -333,19 +346,14 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.map.take_up(map);
         self.map_from_base = map_from_base;
         self.local_covariance = Matrix3::zeros();
-        self.keyframe = Keyframe::at(map_from_base);
-        let sigmas = self.odometry_sigmas();
-        if let Some(joint) = &mut self.joint {
-            joint.clear(sigmas);
-        }
+        self.begin_joint_anew();
     }
 
     /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.
     pub fn loosen(&mut self, by: &Matrix3<f32>) {
         self.local_covariance += by;
-        if let Some(joint) = &mut self.joint {
-            joint.loosen_pose(by, &mut self.map);
-        }
+        self.map_from_base = self.settle() * self.map_from_base;
+        self.loosen_joint(by);
     }
 
     /// Puts in order what a reset in the middle of [`Self::process_scan`] may have left half done. Segments that are not finite leave
@@ -362,13 +370,35 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
                 self.map.forget(index);
             }
         }
+        self.begin_joint_anew();
+        self.closing = PendingClosure::default();
+        true
+    }
+
+    /// From where the robot stands, whose pose is taken as certain.
+    fn begin_joint_anew(&mut self) {
         let sigmas = self.odometry_sigmas();
         if let Some(joint) = &mut self.joint {
             joint.clear(sigmas);
         }
+        self.sightings.clear();
         self.keyframe = Keyframe::at(self.map_from_base);
-        self.closing = PendingClosure::default();
-        true
+        self.note_settled();
+    }
+
+    fn loosen_joint(&mut self, by: &Matrix3<f32>) {
+        if let Some(joint) = &mut self.joint {
+            joint.loosen_pose(by, &mut self.map);
+        }
+        self.note_settled();
+    }
+
+    /// The joint estimate stands at the keyframe, with nothing left to be taken in.
+    fn note_settled(&mut self) {
+        if let Some(joint) = &self.joint {
+            let position = self.keyframe.map_from_base.translation.vector;
+            self.settled = Settled { position, covariance: joint.pose_covariance() };
+        }
     }
 
     fn odometry_sigmas(&self) -> Vector3<f32> {
@@ -382,14 +412,17 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let prior = Prior { pose: moved.pose, covariance };
         if !(motion.is_finite() && is_finite(&prior.pose) && covariance.iter().all(|v| v.is_finite())) {
             self.counters.bad_motion = self.counters.bad_motion.saturating_add(1);
-            if let Some(joint) = &mut self.joint {
-                joint.loosen_pose(&Matrix3::identity(), &mut self.map);
-            }
-            return Prior { pose: self.map_from_base, covariance: Matrix3::identity() };
+            let pose = self.settle() * self.map_from_base;
+            self.loosen_joint(&Matrix3::identity());
+            return Prior { pose, covariance: Matrix3::identity() };
         }
         self.keyframe.since = self.keyframe.since.then(&motion.since_previous);
         self.keyframe.scans = self.keyframe.scans.saturating_add(1);
         self.way_m += motion.since_previous.distance_m;
+        if self.keyframe_is_due() {
+            // The joint estimate moves on.
+            return Prior { pose: self.settle() * prior.pose, ..prior };
+        }
         prior
     }
 
@@ -461,6 +494,14 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.counters.scans.saturating_add(1)
     }
 
+    fn stamp(&self) -> Stamp {
+        Stamp { scan: self.scan_number(), way_m: self.way_m }
+    }
+
+    fn eye(&self) -> Eye {
+        Eye { reach_m: self.reach_m(), line_noise: self.config.line_noise }
+    }
+
     /// How far the sensor sees, metres.
     fn reach_m(&self) -> f32 {
         f32::from(self.config.sensor.codes.max_mm) * 1e-3
@@ -526,9 +567,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
         if let Some(winner) = winner {
             *best = winner;
-            if let Some(joint) = &mut self.joint {
-                joint.loosen_pose(&(broad.covariance - prior.covariance), &mut self.map);
-            }
+            best.pose = self.settle() * winner.pose;
+            self.loosen_joint(&(broad.covariance - prior.covariance));
+            self.find_nearby(&best.pose, |_| true);
         }
         watch(Stage::Association);
         self.associate(best);
@@ -543,6 +584,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if oldest < config.min_way_m {
             return;
         }
+        update.pose = self.settle() * update.pose;
         self.find_nearby(&update.pose, |entry| way_m - entry.seen_at_m >= config.min_way_m);
         let prior = Prior { pose: update.pose, covariance: update.covariance + drift(config, oldest) };
         let mut hypothesis = *update;
@@ -645,36 +687,58 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// From pairs to map, and with it, in the joint estimate, to the pose.
-    fn extend_map(&mut self, update: &mut SlamUpdate) {
-        update.residual_m = self.residual_m(&update.pose);
-        if update.closure.is_none() && !self.keyframe_is_due() {
-            return;
-        }
-        let advanced = self.advance_joint();
-        let seen = Observed {
-            segments: &self.observed,
-            pairs: &self.pairs,
-            stamp: Stamp { scan: self.scan_number(), way_m: self.way_m },
-            reach_m: self.reach_m(),
-            line_noise: &self.config.line_noise,
-        };
-        let (RegistrationConfig::Joint(config), Some(joint)) = (&self.config.registration, &mut self.joint)
-        else {
+    fn register(&mut self, update: &mut SlamUpdate) {
+        let RegistrationConfig::Joint(config) = self.config.registration else {
+            let seen = Observed {
+                segments: &self.observed,
+                pairs: &self.pairs,
+                stamp: self.stamp(),
+                eye: self.eye(),
+            };
             update.registration = register_end_points(&seen, &update.pose, &mut self.map);
             return;
         };
+        if update.closure.is_none() && !self.keyframe_is_due() {
+            let Some(joint) = self.joint.as_mut().filter(|_| self.sightings.wait()) else { return };
+            if !self.sightings.take_in(config.taken_per_scan.into(), &config, joint) {
+                update.pose = self.settle() * update.pose;
+                update.registration.settled = true;
+            }
+            return;
+        }
+        let in_a_row = self.keyframe.scans <= 1;
+        let advanced = self.advance_joint();
         // A closed loop has moved the prediction with the map.
         let carried = update.closure.map(|closure| closure.closed * closure.drifted.inverse());
-        let start = Start {
-            prior: &carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced),
-            pose: &update.pose,
-        };
-        let (pose, report) = register_jointly(&seen, &start, config, joint, &mut self.map, &mut self.nearby);
-        update.registration = report;
-        if is_finite(&pose) {
-            update.pose = pose;
+        let prior = carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced);
+        self.keyframe = Keyframe::at(prior);
+        let start = Start { prior: &prior, pose: &update.pose };
+        let seen =
+            Observed { segments: &self.observed, pairs: &self.pairs, stamp: self.stamp(), eye: self.eye() };
+        let Some(joint) = &mut self.joint else { return };
+        update.registration = self.sightings.make(&seen, &start, &config, joint, &mut self.map);
+        if in_a_row || update.closure.is_some() {
+            update.pose = self.settle() * update.pose;
+            update.registration.settled = true;
         }
-        self.keyframe = Keyframe::at(update.pose);
+    }
+
+    /// Takes in what is left of the last keyframe. Returns by what poses in the map are moved.
+    fn settle(&mut self) -> Isometry2<f32> {
+        let RegistrationConfig::Joint(config) = &self.config.registration else {
+            return Isometry2::identity();
+        };
+        let eye = self.eye();
+        let Some(joint) = &mut self.joint else { return Isometry2::identity() };
+        let (map, near) = (&mut self.map, &mut self.nearby);
+        let Some([before, after]) = self.sightings.settle(&eye, config, joint, map, near) else {
+            return Isometry2::identity();
+        };
+        // Fusing has renumbered the map's segments.
+        self.shortlist.clear();
+        self.keyframe.map_from_base = after;
+        self.note_settled();
+        after * before.inverse()
     }
 
     /// Forgets what the scan has seen through.

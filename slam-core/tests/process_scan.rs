@@ -208,8 +208,8 @@ fn each_stage_is_told_as_it_begins_and_watching_changes_nothing() {
 #[test]
 fn size_in_ram_is_stated() {
     let bytes = Slam::<512>::BYTES;
-    // 68 bytes a map segment (64 and its index, twice), 16 a beam, 28 KiB of the rest.
-    assert!(bytes <= 68 * 512 + 16 * BEAMS + 28 * 1024, "{bytes}");
+    // 68 bytes a map segment (64 and its index, twice), 16 a beam, 30 KiB of the rest.
+    assert!(bytes <= 68 * 512 + 16 * BEAMS + 30 * 1024, "{bytes}");
 }
 
 fn number() -> impl Strategy<Value = f32> {
@@ -295,7 +295,9 @@ proptest! {
         let walls: Vec<_> = seen_often.map(|s| s.transformed(&room_from_map)).collect();
         prop_assert!(walls.len() >= 4, "{:?}", walls);
         for wall in walls {
-            prop_assert!(off_walls_m(wall.start).max(off_walls_m(wall.end)) < 0.05, "{:?}", wall);
+            // The ends do not move along with all of it.
+            prop_assert!(off_walls_m(wall.midpoint()) < 0.03, "{:?}", wall);
+            prop_assert!(off_walls_m(wall.start).max(off_walls_m(wall.end)) < 0.1, "{:?}", wall);
         }
         let off = (start * truth).inverse() * slam.pose();
         prop_assert!(off.translation.vector.norm() < 0.5, "{}", off);
