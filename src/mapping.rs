@@ -218,8 +218,9 @@ impl Mapping {
             self.keeper.mapper().counters()
         );
         defmt::info!(
-            "stack: {=u32} bytes at most, {=u32} in the urgent executor",
+            "stack: {=u32} bytes at most, {=u32} in thread mode, {=u32} in the urgent executor",
             stack::most(),
+            stack::most_in_thread(),
             stack::most_in_interrupts()
         );
     }

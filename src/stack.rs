@@ -1,7 +1,7 @@
 //! How much stack has been used: it is painted before `main`, and what is no longer painted was used.
 //!
-//! Thread mode and interrupts share one stack. What the urgent executor takes beneath its interrupt is measured apart, by painting
-//! what lies beneath anew from time to time.
+//! Thread mode and interrupts share one stack. How deep thread mode is in it is looked up at each interrupt of the urgent executor,
+//! some thousand times a minute; what that executor takes beneath is measured by painting what lies there anew now and then.
 
 use core::ptr::addr_of;
 use core::sync::atomic::{AtomicU32, Ordering};
@@ -20,12 +20,18 @@ const EVERY: u32 = 64;
 const DEPTH: usize = 6 * 1024;
 
 static CALLS: AtomicU32 = AtomicU32::new(0);
+static MOST_IN_THREAD: AtomicU32 = AtomicU32::new(0);
 static MOST_IN_INTERRUPTS: AtomicU32 = AtomicU32::new(0);
 
 /// Most bytes of stack used so far, interrupts included.
 pub fn most() -> u32 {
     let (lowest, top) = (addr_of!(_stack_end) as usize, addr_of!(_stack_start) as usize);
     (top - first_used(lowest, top)) as u32
+}
+
+/// Most bytes that thread mode was seen to take, where the urgent executor interrupted it.
+pub fn most_in_thread() -> u32 {
+    MOST_IN_THREAD.load(Ordering::Relaxed)
 }
 
 /// Most bytes that the urgent executor was seen to take.
@@ -35,10 +41,11 @@ pub fn most_in_interrupts() -> u32 {
 
 /// Does the urgent executor's work, and looks now and then how much stack it takes.
 pub fn watched(work: impl FnOnce()) {
+    let here = msp::read() as usize & !3;
+    MOST_IN_THREAD.fetch_max((addr_of!(_stack_start) as usize - here) as u32, Ordering::Relaxed);
     if !CALLS.fetch_add(1, Ordering::Relaxed).is_multiple_of(EVERY) {
         return work();
     }
-    let here = msp::read() as usize & !3;
     let lowest = here.saturating_sub(DEPTH).max(addr_of!(_stack_end) as usize);
     for address in (lowest..here).step_by(4) {
         // SAFETY: a word of the stack's memory beneath the stack pointer, which nothing holds.

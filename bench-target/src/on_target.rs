@@ -145,15 +145,31 @@ fn kernels() {
 fn functions() {
     use micromath::F32Ext;
     let angle = |k: u32| -3.1 + 0.097 * k as f32;
-    function("sin", |k| libm::sinf(angle(k)), |k| F32Ext::sin(angle(k)));
-    function("cos", |k| libm::cosf(angle(k)), |k| F32Ext::cos(angle(k)));
-    function("atan2", |k| libm::atan2f(angle(k), angle(k + 7)), |k| F32Ext::atan2(angle(k), angle(k + 7)));
+    let wide = |k: u32| f64::from(angle(k));
     let both = |(s, c): (f32, f32)| s + c;
-    function("sin_cos", |k| both(slam_core::math::sin_cos(angle(k))), |k| both(F32Ext::sin_cos(angle(k))));
-    function("sqrt", |k| libm::sqrtf(k as f32), |k| F32Ext::sqrt(k as f32));
+    function("sin", |k| libm::sinf(angle(k)), |k| F32Ext::sin(angle(k)), |k| libm::sin(wide(k)));
+    function("cos", |k| libm::cosf(angle(k)), |k| F32Ext::cos(angle(k)), |k| libm::cos(wide(k)));
+    function(
+        "atan2",
+        |k| libm::atan2f(angle(k), angle(k + 7)),
+        |k| F32Ext::atan2(angle(k), angle(k + 7)),
+        |k| libm::atan2(wide(k), wide(k + 7)),
+    );
+    function(
+        "sin_cos",
+        |k| both(slam_core::math::sin_cos(angle(k))),
+        |k| both(F32Ext::sin_cos(angle(k))),
+        |k| libm::sin(wide(k)) + libm::cos(wide(k)),
+    );
+    function("sqrt", |k| libm::sqrtf(k as f32), |k| F32Ext::sqrt(k as f32), |k| libm::sqrt(f64::from(k)));
 }
 
-fn function(name: &str, libm: impl Fn(u32) -> f32, micromath: impl Fn(u32) -> f32) {
+fn function(
+    name: &str,
+    ours: impl Fn(u32) -> f32,
+    micromath: impl Fn(u32) -> f32,
+    exact: impl Fn(u32) -> f64,
+) {
     let cycles = |f: &dyn Fn(u32) -> f32| {
         count(|| {
             for k in 0..CALLS {
@@ -163,5 +179,15 @@ fn function(name: &str, libm: impl Fn(u32) -> f32, micromath: impl Fn(u32) -> f3
     };
     let around = cycles(&|k| k as f32);
     let each = |f: &dyn Fn(u32) -> f32| cycles(f).saturating_sub(around) / CALLS;
-    defmt::println!("function {=str} {=u32} {=u32}", name, each(&libm), each(&micromath));
+    let error = |f: &dyn Fn(u32) -> f32| {
+        (0..CALLS).map(|k| (f64::from(f(k)) - exact(k)).abs()).fold(0.0, f64::max) as f32
+    };
+    defmt::println!(
+        "function {=str} {=u32} {=u32} {=f32} {=f32}",
+        name,
+        each(&ours),
+        each(&micromath),
+        error(&ours),
+        error(&micromath)
+    );
 }

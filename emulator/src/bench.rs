@@ -30,10 +30,21 @@ const BUDGET_SEGMENTS: usize = 200;
 pub struct Measured {
     /// Loops counted by hand: name, turns, instructions.
     pub kernels: Vec<(String, u32, u32)>,
-    /// Functions: name, instructions of libm's and of micromath's.
-    pub functions: Vec<(String, u32, u32)>,
+    /// Transcendental functions.
+    pub functions: Vec<Function>,
     /// Runs over the set of scans.
     pub runs: Vec<Run>,
+}
+
+/// A function of libm or of the core, and micromath's, over some arguments.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Function {
+    /// What it computes.
+    pub name: String,
+    /// Instructions of both.
+    pub instructions: [u32; 2],
+    /// Largest error of both, against libm in double precision.
+    pub errors: [f32; 2],
 }
 
 /// The set of scans with one configuration and map.
@@ -122,11 +133,21 @@ impl Measured {
     fn take(&mut self, text: &str) -> anyhow::Result<()> {
         let (what, rest) = text.split_once(' ').context("a line of one word")?;
         match what {
-            "kernel" | "function" => {
+            "kernel" => {
                 let words: Vec<&str> = rest.split(' ').collect();
-                let [name, a, b] = words[..] else { bail!("three words are expected") };
-                let list = if what == "kernel" { &mut self.kernels } else { &mut self.functions };
-                list.push((name.to_owned(), a.parse()?, b.parse()?));
+                let [name, turns, instructions] = words[..] else { bail!("three words are expected") };
+                self.kernels.push((name.to_owned(), turns.parse()?, instructions.parse()?));
+            }
+            "function" => {
+                let words: Vec<&str> = rest.split(' ').collect();
+                let [name, ours, micromath, error, micromath_error] = words[..] else {
+                    bail!("five words are expected")
+                };
+                self.functions.push(Function {
+                    name: name.to_owned(),
+                    instructions: [ours.parse()?, micromath.parse()?],
+                    errors: [error.parse()?, micromath_error.parse()?],
+                });
             }
             "run" => {
                 let (name, known) = rest.split_once(' ').context("two words are expected")?;
@@ -191,9 +212,11 @@ impl Measured {
                 run.scans.last().map_or(0, |s| s.segments)
             );
         }
-        println!("\nfunction: instructions of libm (sin_cos: of the core), of micromath");
-        for (name, libm, micromath) in &self.functions {
-            println!("{name:<8} {libm:>6} {micromath:>6}");
+        println!("\nfunction: instructions and largest error of libm (sin_cos: of the core), of micromath");
+        for Function { name, instructions: [ours, micromath], errors: [error, micromath_error] } in
+            &self.functions
+        {
+            println!("{name:<8} {ours:>6} {error:>8.1e} {micromath:>6} {micromath_error:>8.1e}");
         }
         println!("\nloops counted by hand: turns, instructions");
         for (name, turns, instructions) in &self.kernels {
@@ -245,13 +268,19 @@ mod tests {
         assert!(measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 50").is_err(), "no run has begun");
         measured.take("run default 50").unwrap();
         measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 51").unwrap();
-        measured.take("function sin 1262 22").unwrap();
-        assert_eq!(measured.functions, [("sin".to_owned(), 1262, 22)]);
+        measured.take("function sin 1262 22 0.0000001 0.002").unwrap();
+        let sin = Function { name: "sin".to_owned(), instructions: [1262, 22], errors: [1e-7, 2e-3] };
+        assert_eq!(measured.functions, [sin]);
         let scan = measured.runs[0].scans[0];
         assert_eq!((scan.total(), scan.points, scan.keyframe, scan.segments), (21, 600, true, 51));
-        for bad in
-            ["", "scan [1, 2] 600 true 51", "scan [1, 2, 3, 4, 5, x] 1 true 1", "run default", "walk 1"]
-        {
+        for bad in [
+            "",
+            "scan [1, 2] 600 true 51",
+            "scan [1, 2, 3, 4, 5, x] 1 true 1",
+            "run default",
+            "walk 1",
+            "function sin 1 2",
+        ] {
             assert!(measured.take(bad).is_err(), "{bad}");
         }
     }

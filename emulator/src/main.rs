@@ -165,6 +165,7 @@ fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
         None => format!("none of {} found", r.corners),
     };
     let [median, p99, max] = r.update_us.map(|us| f64::from(us) * 1e-3);
+    let kib = |bytes: u32| f64::from(bytes) / 1024.0;
     let rows = [
         ("world", format!("{}, seed {}", r.world, r.seed)),
         (
@@ -187,9 +188,11 @@ fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
         (
             "RAM",
             format!(
-                "{:.1} KiB of variables, {:.1} KiB of stack at most",
+                "{:.1} KiB of variables, {:.1} KiB of stack at most ({:.1} in thread mode, {:.1} in the urgent executor)",
                 r.static_bytes as f64 / 1024.0,
-                f64::from(r.stack_bytes[0]) / 1024.0
+                kib(r.stack_bytes[0]),
+                kib(r.stack_bytes[1]),
+                kib(r.stack_bytes[2])
             ),
         ),
         ("resets, warnings", format!("{}, {}", r.resets, r.warnings)),

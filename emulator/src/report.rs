@@ -52,8 +52,9 @@ pub struct Report {
     pub resets: usize,
     /// Warnings and errors in the log.
     pub warnings: usize,
-    /// Most bytes of stack used: in all, and by the urgent executor. Zero where the run was too short to say.
-    pub stack_bytes: [u32; 2],
+    /// Most bytes of stack used: in all, by thread mode where it was interrupted, and by the urgent executor. Zero where the run
+    /// was too short to say.
+    pub stack_bytes: [u32; 3],
     /// Bytes of the firmware's variables.
     pub static_bytes: u64,
     /// Instructions executed.
@@ -138,13 +139,14 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
 }
 
 /// What the firmware's status said of its stack, at the most.
-fn stack_bytes(outcome: &Outcome) -> [u32; 2] {
+fn stack_bytes(outcome: &Outcome) -> [u32; 3] {
     let said = outcome.log.iter().filter_map(|line| {
         let (all, rest) = line.text.strip_prefix("stack: ")?.split_once(" bytes at most, ")?;
+        let (thread, rest) = rest.split_once(" in thread mode, ")?;
         let (urgent, _) = rest.split_once(' ')?;
-        Some([all.parse().ok()?, urgent.parse().ok()?])
+        Some([all.parse().ok()?, thread.parse().ok()?, urgent.parse().ok()?])
     });
-    said.fold([0; 2], |most: [u32; 2], now: [u32; 2]| [most[0].max(now[0]), most[1].max(now[1])])
+    said.fold([0u32; 3], |most, now: [u32; 3]| std::array::from_fn(|k| most[k].max(now[k])))
 }
 
 /// The map that the firmware printed last when its button was pressed.

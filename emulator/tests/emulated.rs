@@ -28,8 +28,9 @@ fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
     assert!(poses * 100 >= report.scans_used * 95, "{poses} of {}", report.scans_used);
     assert!(outcome.led_changes > 100);
     // Variables and stack, of the executor in thread mode with all interrupts on top.
-    let [stack, urgent] = report.stack_bytes;
-    assert!(stack > 2000 && urgent > 200, "{stack} {urgent}");
+    let [stack, thread, urgent] = report.stack_bytes;
+    assert!(thread > 2000 && urgent > 200, "{thread} {urgent}");
+    assert!((thread..=thread + urgent + 1024).contains(&stack), "{stack} {thread} {urgent}");
     let bytes = report.static_bytes + u64::from(stack);
     assert!(bytes <= 96 * 1024, "{bytes} bytes of RAM");
 }

@@ -69,7 +69,7 @@ const LOGS: [Recorded; 5] = [
         limit_m: 0.09,
         noisy_limit_m: 0.15,
         reference_thickness_m: 0.016,
-        thicker: 1.1,
+        thicker: 1.3,
     },
 ];
 

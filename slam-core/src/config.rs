@@ -104,6 +104,7 @@ impl Default for SlamConfig {
                 max_mean_chi2: 2.0,
                 min_inliers: 6,
                 min_length_m: 0.15,
+                max_round_radius_m: 0.5,
                 max_sigma_direction_rad: 0.2,
             }),
             line_noise: LineNoise { sigma_offset_m: 0.01, sigma_direction_rad: 0.002 },
@@ -135,13 +136,13 @@ impl Default for SlamConfig {
             }),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
             registration: RegistrationConfig::Joint(JointConfig {
-                keyframes: KeyframeConfig { way_m: 0.15, scans: 10, at_start: 4, spacing_between_m: 0.07 },
+                keyframes: KeyframeConfig { way_m: 0.15, scans: 10, at_start: 10, spacing_between_m: 0.07 },
                 max_taken: 12,
                 max_learning: 6,
                 taken_per_scan: 6,
                 least_gain: 0.1,
                 max_chi2: 60.0,
-                kernel_chi2: 1.5,
+                kernel_chi2: 2.0,
                 young_hits: 4,
                 young_scans_per_hit: 2.1,
                 fuse_max_angle_rad: 0.1,
@@ -238,6 +239,7 @@ impl SlamConfig {
                 positive("extraction.split.max_mean_chi2", c.max_mean_chi2)?;
                 check("extraction.split.min_inliers", c.min_inliers >= 2)?;
                 not_negative("extraction.split.min_length_m", c.min_length_m)?;
+                not_negative("extraction.split.max_round_radius_m", c.max_round_radius_m)?;
                 positive("extraction.split.max_sigma_direction_rad", c.max_sigma_direction_rad)?;
             }
         }

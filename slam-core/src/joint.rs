@@ -93,9 +93,16 @@ impl Derivative {
     /// What the numbers change by when all states change by these.
     fn times(&self, changes: &[f32; STATES]) -> [f32; 2] {
         let mut sums = [0.0; 2];
-        for (state, [o, d]) in self.entries() {
-            let change = changes.get(state).copied().unwrap_or(0.0);
-            sums = [sums[0] + o * change, sums[1] + d * change];
+        let mut add = |first: usize, derivatives: [&[f32]; 2]| {
+            for (sum, by) in sums.iter_mut().zip(derivatives) {
+                let changes = changes.get(first..first + by.len()).unwrap_or_default();
+                by.iter().zip(changes).for_each(|(by, change)| *sum += by * change);
+            }
+        };
+        add(POSE, self.by_pose.each_ref().map(|by| by.as_slice()));
+        for (place, by_line) in &self.by_lines {
+            let [first, _] = states_of(*place);
+            add(first, by_line.each_ref().map(|by| by.as_slice()));
         }
         sums
     }
@@ -317,9 +324,9 @@ impl Joint {
         self.ages_scans.get(place).copied().unwrap_or(0.0)
     }
 
-    /// Whether a line has this place.
-    pub(crate) fn tracks(&self, place: usize) -> bool {
-        self.owners.get(place).is_some_and(Option::is_some)
+    /// Index in the map of the line that has this place.
+    pub(crate) fn owner(&self, place: usize) -> Option<usize> {
+        self.owners.get(place).copied().flatten().map(usize::from)
     }
 
     /// The place of a map segment among the lines, if it is tracked.
@@ -637,13 +644,11 @@ impl Joint {
         within(own - explained, 0.01 * own, own).max(LEAST_VARIANCE)
     }
 
-    /// Tracks a segment just added to the map, with these variances of its own. It was seen from a pose that has the estimate's errors,
-    /// but lies `since_prior`, in (x, y, θ), from the pose of the estimate at `position`.
+    /// Tracks a segment just added to the map, seen from the pose with these variances of its own.
     pub(crate) fn add<const N: usize>(
         &mut self,
         index: usize,
         position: Vector2<f32>,
-        since_prior: &Vector3<f32>,
         map: &mut SegmentMap<N>,
     ) {
         let Some(segment) = map.segments().get(index).map(|s| s.segment) else { return };
@@ -677,12 +682,6 @@ impl Joint {
         self.set(offset, offset, var_offset);
         self.set(direction, direction, var_direction);
         self.set(offset, direction, d_with_o);
-        // The estimate has it where it lies as seen from its own pose.
-        for (state, by) in own.into_iter().zip(seen.by_pose) {
-            if let Some(shift) = self.shift.get_mut(state) {
-                *shift = -Vector3::from(by).dot(since_prior);
-            }
-        }
     }
 }
 
@@ -948,7 +947,7 @@ mod tests {
             self.believed = self.joint.settle(&self.believed, &mut self.map);
             for (i, in_base) in new {
                 let index = self.map.insert(in_base.transformed(&self.believed), self.scan, 0.0).unwrap();
-                self.joint.add(index, self.believed.translation.vector, &Vector3::zeros(), &mut self.map);
+                self.joint.add(index, self.believed.translation.vector, &mut self.map);
                 self.known[i] = Some(index);
             }
         }
@@ -1064,7 +1063,7 @@ mod tests {
         let mut world = World::new(2);
         world.look();
         let known = world.joint.owners.iter().flatten().count();
-        world.joint.add(0, Vector2::zeros(), &Vector3::zeros(), &mut world.map);
+        world.joint.add(0, Vector2::zeros(), &mut world.map);
         assert_eq!(world.joint.owners.iter().filter(|owner| **owner == Some(0)).count(), 1);
         assert_eq!(world.joint.owners.iter().flatten().count(), known);
     }

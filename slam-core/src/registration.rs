@@ -22,6 +22,8 @@ use crate::segment::{Moments, Segment};
 
 /// Most sightings of a keyframe that are taken in.
 pub const MAX_TAKEN: usize = 12;
+/// Most segments of a keyframe that are made longer once it is settled; others are at once.
+const MAX_LONGER: usize = 24;
 
 /// How segments enter the map.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -196,11 +198,13 @@ impl Start<'_> {
 /// The sightings of a keyframe on their way into the joint estimate of the pose, the odometry's errors and the lines.
 ///
 /// The estimate stays at the keyframe until all are taken in, and the map as it was; then pose and lines move at once. What is
-/// new enters the map with the keyframe.
+/// new enters the map with the keyframe, and the estimate at the end.
 #[derive(Clone, Debug, Default)]
 pub struct Sightings {
     /// In the order of the scan.
     list: Vec<Sighting, MAX_TAKEN>,
+    /// Segments that go on beyond the ends of theirs in the map: the place of that among the lines, and both ends in `base`.
+    longer: Vec<(usize, [Point2<f32>; 2]), MAX_LONGER>,
     /// How many of them have been taken in.
     taken: usize,
     /// Where they were made from, until they are settled.
@@ -236,12 +240,13 @@ impl Sightings {
     /// Drops them.
     pub fn clear(&mut self) {
         self.list.clear();
+        self.longer.clear();
         (self.taken, self.made) = (0, None);
     }
 
     /// Makes the sightings of a keyframe, and adds to the map what is not known.
     ///
-    /// Work: for each pair some steps, and one for each other pair; for each new segment the number of states tracked.
+    /// Work: for each pair some steps, and one for each other pair.
     pub fn make<const N: usize>(
         &mut self,
         seen: &Observed<'_>,
@@ -286,8 +291,9 @@ impl Sightings {
                 mark_seen(entry, &seen.stamp);
                 let moments = &mut entry.segment.moments;
                 moments.inliers = moments.inliers.saturating_add(segment.moments.inliers);
-                let longer = entry.segment.extended([start.pose * segment.start, start.pose * segment.end]);
-                if longer.is_finite() {
+                let ends = [segment.start, segment.end];
+                let longer = entry.segment.extended(ends.map(|end| start.pose * end));
+                if longer.length_m() > entry.segment.length_m() && self.longer.push((place, ends)).is_err() {
                     entry.segment = longer;
                 }
             }
@@ -297,10 +303,7 @@ impl Sightings {
             let [var_offset, var_direction] =
                 with_line_noise(variances(segment), &seen.eye.line_noise, segment.length_m());
             let segment = with_variances(&segment.transformed(start.pose), var_offset, var_direction);
-            if segment.is_finite()
-                && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
-            {
-                joint.add(index, start.prior.translation.vector, &start.since_prior(), map);
+            if segment.is_finite() && map.insert(segment, seen.stamp.scan, seen.stamp.way_m).is_some() {
                 report.new += 1;
             }
         }
@@ -316,7 +319,7 @@ impl Sightings {
         for sighting in self.list.iter().skip(begin).take(most) {
             self.taken += 1;
             // A line that has been forgotten since is no more.
-            if joint.tracks(sighting.place) {
+            if joint.owner(sighting.place).is_some() {
                 joint.measure(&sighting.measurement, &trust, sighting.learning);
             }
         }
@@ -326,7 +329,7 @@ impl Sightings {
     /// Takes in what is left, moves pose and lines, and fuses walls. Returns the keyframe's pose as it was thought to be, and as it is; in
     /// `near` the map segments around it. `None` where there is nothing to settle.
     ///
-    /// Work: for the lines tracked one step each; for fusing, one step for each map segment that was seen and each one
+    /// Work: for the lines tracked one step each; for each new segment the number of states tracked; for fusing, one step for each map segment that was seen and each one
     /// around the robot, and one for each map segment.
     pub fn settle<const N: usize>(
         &mut self,
@@ -339,6 +342,26 @@ impl Sightings {
         self.take_in(MAX_TAKEN, config, joint);
         let Made { prior, pose, scan } = self.made.take()?;
         let mut settled = joint.settle(&prior, map);
+        for &(place, ends) in &self.longer {
+            if let Some(entry) = joint.owner(place).and_then(|index| map.get_mut(index)) {
+                let longer = entry.segment.extended(ends.map(|end| settled * end));
+                if longer.is_finite() {
+                    entry.segment = longer;
+                }
+            }
+        }
+        // What is new lies as it was seen from where the robot was.
+        let moved = settled * pose.inverse();
+        for index in 0..map.segments().len() {
+            let Some(entry) = map.get_mut(index).filter(|e| e.last_seen == scan && e.hits == 1) else {
+                continue;
+            };
+            let segment = entry.segment.transformed(&moved);
+            if segment.is_finite() {
+                entry.segment = segment;
+                joint.add(index, settled.translation.vector, map);
+            }
+        }
         fuse_walls(scan, eye, config, &mut settled, joint, map, near);
         Some([pose, if is_finite(&settled) { settled } else { pose }])
     }

@@ -295,7 +295,7 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
     say(&format!(
         "The normalised estimation error squared (NEES) of the pose is 3 on average when the covariance is that of the error. \
          Held\nagainst it at {NEES_INSTANTS} instants of each drive. A segment is spurious when it was seen in at least three \
-         scans and its middle\nis farther than 0.15 m from everything that stands still."
+         scans and most\nof it is farther than 0.15 m from everything that stands still."
     ));
     say(&honesty(results).to_string());
     say("## Two parallel walls");

@@ -20,6 +20,8 @@ const SIDE_PROBE_M: [f64; 2] = [0.2, 0.02];
 const SIGHTING_STEP: usize = 5;
 /// A segment farther than this from everything that stands still is spurious, metres.
 const SPURIOUS_M: f64 = 0.15;
+/// Pieces of a segment that are looked at, metres.
+const PIECE_M: f64 = 0.05;
 
 /// Instants of a drive at which the pose's error is held against its covariance.
 pub const NEES_INSTANTS: usize = 50;
@@ -241,9 +243,38 @@ fn line_for(
     Some((nalgebra::convert(line.normal), f64::from(line.distance_m)))
 }
 
+/// Whether most of a segment lies far from everything that stands still. A wall that goes on behind a door is none, though its
+/// middle may lie in the door.
 fn is_spurious(segment: &Segment, edges: &[Edge], discs: &[Disc]) -> bool {
-    let middle: Point2<f64> = nalgebra::convert(segment.midpoint());
-    let near_edge = |e: &Edge| super::scanner::distance_to(e, middle) <= SPURIOUS_M;
-    let near_disc = |d: &Disc| ((d.centre - middle).norm() - d.radius).abs() <= SPURIOUS_M;
-    !edges.iter().any(near_edge) && !discs.iter().any(near_disc)
+    let near = |point: Point2<f64>| {
+        let near_edge = |e: &Edge| super::scanner::distance_to(e, point) <= SPURIOUS_M;
+        let near_disc = |d: &Disc| ((d.centre - point).norm() - d.radius).abs() <= SPURIOUS_M;
+        edges.iter().any(near_edge) || discs.iter().any(near_disc)
+    };
+    let [from, to]: [Point2<f64>; 2] = [segment.start, segment.end].map(nalgebra::convert);
+    let pieces = ((to - from).norm() / PIECE_M).ceil().max(1.0) as usize;
+    let middle = |piece: usize| from + (to - from) * ((piece as f64 + 0.5) / pieces as f64);
+    2 * (0..pieces).filter(|piece| near(middle(*piece))).count() < pieces
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_stands_where_nothing_stands_is_spurious_and_a_wall_across_a_door_is_not() {
+        let edge = |from: [f64; 2], to: [f64; 2]| Edge { from: from.into(), to: to.into(), glass: false };
+        let edges = [edge([0.0, 0.0], [4.0, 0.0]), edge([5.0, 0.0], [9.0, 0.0])];
+        let discs = [Disc { centre: Point2::new(4.5, 3.0), radius: 0.3 }];
+        let is_spurious = |from: [f32; 2], to: [f32; 2]| {
+            let segment = Segment::from_ends(from.into(), to.into(), 20, 1e-4, Point2::new(4.0, 1.0));
+            super::is_spurious(&segment, &edges, &discs)
+        };
+        assert!(!is_spurious([0.0, 0.02], [9.0, -0.02]), "a wall across its door");
+        assert!(!is_spurious([4.3, 2.7], [4.7, 2.7]), "the face of a pillar");
+        assert!(is_spurious([4.2, 0.0], [4.8, 0.0]), "a person in the door");
+        assert!(is_spurious([2.0, 1.0], [2.4, 1.0]), "a person in the room");
+        assert!(is_spurious([3.7, 0.3], [7.0, 0.3]), "a wall that is none");
+        assert!(is_spurious([3.0, 0.1], [3.0, 1.5]), "a wall that begins at one");
+    }
 }

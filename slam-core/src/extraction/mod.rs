@@ -214,6 +214,37 @@ mod tests {
         assert!(segments.iter().all(|s| s.length_m() < 0.25), "{segments:?}");
     }
 
+    /// A round post of this radius, seen from the origin.
+    fn post(centre: (f32, f32), radius_m: f32) -> StdVec<Wall> {
+        let at = |k: i32| {
+            let (s, c) = crate::math::sin_cos(k as f32 * core::f32::consts::PI / 24.0);
+            (centre.0 + radius_m * c, centre.1 + radius_m * s)
+        };
+        (0..48).map(|k| (at(k), at(k + 1))).collect()
+    }
+
+    #[test]
+    fn round_things_give_no_segments_and_boxes_do() {
+        let config = SlamConfig::default().extraction;
+        for (distance, radius_m) in [(1.5, 0.2), (2.5, 0.22), (3.0, 0.3), (4.0, 0.3), (4.0, 0.45)] {
+            let noise_m = 0.01f32.max(0.01 * distance);
+            let segments = run(&scan(&post((distance, 0.3), radius_m), noise_m), &config);
+            assert!(segments.is_empty(), "{radius_m} m at {distance} m: {segments:?}");
+        }
+        for distance in [1.5, 2.5, 3.5] {
+            let (x, y, half) = (distance + 0.35, 0.2, 0.35);
+            // On its edge, and turned to the robot.
+            let edge = [((x, y + half), (x - half, y)), ((x - half, y), (x, y - half))];
+            let face = [((x - half, y - half), (x - half, y + half))];
+            let noise_m = 0.01f32.max(0.01 * distance);
+            assert_eq!(run(&scan(&edge, noise_m), &config).len(), 2, "box at {distance} m");
+            assert_eq!(run(&scan(&face, noise_m), &config).len(), 1, "face at {distance} m");
+        }
+        // From inside a bay is a bay.
+        let bay: StdVec<Wall> = post((0.0, 0.0), 0.45);
+        assert!(!run(&scan(&bay, 0.01), &config).is_empty());
+    }
+
     #[test]
     fn covariance_of_a_line_is_that_of_its_noise() {
         let points = scan(&[((2.0, -1.0), (2.0, 1.0))], 0.0);

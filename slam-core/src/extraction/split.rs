@@ -3,13 +3,13 @@
 //! The points are cut into clusters where neighbours lie farther apart than a surface at grazing incidence explains.
 //! A cluster is cut at the point farthest from its chord, in standard deviations of that point's range, until every
 //! piece is straight; neighbouring pieces that are one line after all are joined again; ends that lean off the line
-//! (corners, mixed pixels) are trimmed. Each line is the total-least-squares fit, weighted by range noise.
+//! (corners, mixed pixels) are trimmed. A cluster that is round is no wall: its chord turns as the robot passes by. Each line is the total-least-squares fit, weighted by range noise.
 //!
 //! Reference: Nguyen et al., "A comparison of line extraction algorithms using 2D range data" (2007), which found
 //! split-and-merge fastest and among the most correct. The chi-square tests are ours.
 
 use heapless::Vec;
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector2};
 
 use super::strip::{Frame, Sums, VarianceAcross};
 use super::{Collector, Viewpoint};
@@ -28,6 +28,10 @@ const LOST_SIGMAS: f32 = 4.0;
 const PARTS: usize = 8;
 /// Fewest points on either side of such a cut.
 const LEAST_PART: usize = 3;
+/// Fewer points than these do not tell a circle from a corner.
+const LEAST_ROUND: usize = 15;
+/// χ² by which a circle may be worse than a corner, which has two numbers more to fit.
+const MARGIN: f32 = 6.0;
 /// A line goes on behind this many points off it.
 const MOST_STRAYS: usize = 2;
 
@@ -54,6 +58,8 @@ pub struct SplitConfig {
     pub min_inliers: u32,
     /// Shortest segment, metres.
     pub min_length_m: f32,
+    /// A cluster that a circle up to this radius explains, and a line does not, is round, metres.
+    pub max_round_radius_m: f32,
     /// A segment whose direction is less sure than this, by its points' noise, is a cluster and no line, radians.
     pub max_sigma_direction_rad: f32,
 }
@@ -111,7 +117,7 @@ impl Extraction<'_> {
     }
 
     fn split_cluster(&self, cluster: &[ScanPoint], out: &mut Collector<'_>) {
-        if (cluster.len() as u32) < self.config.min_inliers {
+        if (cluster.len() as u32) < self.config.min_inliers || self.is_round(cluster) {
             return;
         }
         let mut stack: Vec<(usize, usize), STACK> = Vec::new();
@@ -142,6 +148,55 @@ impl Extraction<'_> {
             };
         }
         self.close(cluster, open, out);
+    }
+
+    /// Whether a cluster is a pillar, a leg or a person: small, and better explained by a circle (Kåsa's fit) than by a line, or by
+    /// two that meet in a corner.
+    fn is_round(&self, cluster: &[ScanPoint]) -> bool {
+        // The first and the last may be mixed with what lies behind.
+        let Some([_, points @ .., _]) = Some(cluster).filter(|c| c.len() >= LEAST_ROUND + 2) else {
+            return false;
+        };
+        let most_m = self.config.max_round_radius_m;
+        let (Some(chord), Some([first, .., last])) = (Frame::of_chord(points, self.view), Some(points))
+        else {
+            return false;
+        };
+        if (last.position - first.position).norm_squared() > 4.0 * most_m * most_m {
+            return false;
+        }
+        let weight = 1.0 / self.view.sensor.noise.variance(first.range_m);
+        let moments =
+            |points: &[ScanPoint]| Moments::from_points(points.iter().map(|p| (p.position, weight)));
+        let all = moments(points);
+        let [xx, xy, yy] = all.scatter;
+        let third = points.iter().fold(Vector2::zeros(), |sum, point| {
+            let off = point.position - all.centroid;
+            sum + off * (weight * off.norm_squared())
+        });
+        let to_centre = Vector2::new(third.x * yy - third.y * xy, third.y * xx - third.x * xy)
+            * (0.5 / (xx * yy - xy * xy));
+        let radius_m = sqrt(to_centre.norm_squared() + (xx + yy) / all.weight);
+        // Seen from outside it is a thing, from inside a niche. False where the points lie on a line, and there is no circle.
+        let is_thing = radius_m <= most_m && to_centre.dot(&(all.centroid - self.view.position)) > 0.0;
+        if !is_thing {
+            return false;
+        }
+        let centre = all.centroid + to_centre;
+        let off_circle = |point: &ScanPoint| sqrt((point.position - centre).norm_squared()) - radius_m;
+        let circle: f32 = points.iter().map(off_circle).map(|off| weight * off * off).sum();
+        if all.residual() - circle < CHANCE_CHI2 {
+            return false;
+        }
+        let (mut farthest, mut at) = (0.0, 0);
+        for (index, point) in points.iter().enumerate() {
+            let off = chord.off(point).abs();
+            if off > farthest {
+                (farthest, at) = (off, index);
+            }
+        }
+        let (before, behind) = points.split_at(at.min(points.len()));
+        circle <= moments(before).residual() + moments(behind).residual() + MARGIN
     }
 
     fn close(&self, cluster: &[ScanPoint], open: Option<(usize, usize, Moments)>, out: &mut Collector<'_>) {
