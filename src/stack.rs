@@ -1,7 +1,7 @@
 //! How much stack has been used: it is painted before `main`, and what is no longer painted was used.
 //!
-//! Thread mode and interrupts share one stack. How deep thread mode is in it is looked up at each interrupt of the urgent executor,
-//! some thousand times a minute; what that executor takes beneath is measured by painting what lies there anew now and then.
+//! Thread mode and interrupts share one stack. How deep thread mode is in it is looked up at each interrupt of the urgent
+//! executor; what that executor takes beneath is measured by painting what lies there anew now and then.
 
 use core::ptr::addr_of;
 use core::sync::atomic::{AtomicU32, Ordering};

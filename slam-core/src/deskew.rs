@@ -50,8 +50,9 @@ pub struct DeskewReport {
     pub bad: u32,
 }
 
-/// Places the beams of a scan. Up to two beams behind each one placed are left out where a surface that faces the sensor has its
-/// points no farther apart than `spacing_m` then; zero places all. Work: one step for each beam placed or without a distance.
+/// Places the beams of a scan. Up to two beams behind each one placed are left out where a surface that faces the sensor
+/// has its points no farther apart than `spacing_m` then; zero places all. Work: one step for each beam placed or without
+/// a distance.
 pub fn deskew(
     scan: &Scan<'_>,
     motion: &ScanMotion,

@@ -510,9 +510,9 @@ impl Joint {
         learning: Learning,
     ) {
         let ranges = learning.states();
+        let states = self.states();
         let mut rest = self.covariance.as_mut_slice();
-        let states = self.owners.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
-        for state in 0..FIRST_LINE + 2 * states {
+        for state in 0..states {
             let Some((row, below)) = rest.split_at_mut_checked(state + 1) else { return };
             rest = below;
             let mut gains = information;

@@ -1,10 +1,10 @@
 //! Which scans the map is built from.
 //!
 //! Scans taken from nearly the same place share errors: corners cut alike, edges mixed alike. Taking in each of them would
-//! make the map sure of what they have in common, and would cost the most work where there is least to learn. So the joint
-//! estimate takes in a scan when the robot has moved on since the last one it took in, and now and then while it stands.
-//! The pose of every other scan is corrected against the map as the last keyframe left it, by fewer beams; and while the robot goes on, what the
-//! keyframe saw is taken in bit by bit, so that no scan takes long.
+//! make the map sure of what they have in common, and would cost the most work where there is least to learn. So the
+//! joint estimate takes in a scan when the robot has moved on since the last one it took in, and now and then while it
+//! stands. The pose of every other scan is corrected against the map as the last keyframe left it, by fewer beams; and
+//! while the robot goes on, what the keyframe saw is taken in bit by bit, so that no scan takes long.
 
 use nalgebra::{Isometry2, Matrix3, Vector2};
 
@@ -22,8 +22,8 @@ pub struct KeyframeConfig {
     pub scans: u32,
     /// All scans up to this number are keyframes: what is seen first says where the map's frame lies.
     pub at_start: u32,
-    /// A scan between keyframes only follows the robot. Beams of it are left out where that leaves points no farther apart than
-    /// this on a surface that faces the sensor, metres.
+    /// A scan between keyframes only follows the robot. Beams of it are left out where that leaves points no farther
+    /// apart than this on a surface that faces the sensor, metres.
     pub spacing_between_m: f32,
 }
 

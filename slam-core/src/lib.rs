@@ -1,6 +1,6 @@
 //! Line-segment SLAM for a microcontroller: a laser scanner, two wheel encoders, a map of line segments in fixed
-//! memory. No allocation, no `unsafe`, no clock, no panic; plain `f32` and one `libm`, so that every machine computes the same
-//! bits (tested on the PC and on a Cortex-M4F in emulation).
+//! memory. No allocation, no `unsafe`, no clock, no panic; plain `f32` and one `libm`, so that every machine computes
+//! the same bits (tested on the PC and on a Cortex-M4F in emulation).
 //!
 //! The algorithm is that of "Least-square Matching for Mobile Robot SLAM Based on Line-segment Model":
 //! [`SlamConfig::paper`] is the paper step for step, [`SlamConfig::default`] our best, through the same pipeline.
@@ -13,8 +13,9 @@
 //!                             └───── pose, odometry's errors ◄───────┘ loop closure
 //! ```
 //!
-//! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are [`keyframe`]s the
-//! joint estimate then has the last word on the pose, on the odometry's errors and on the lines, a few scans later.
+//! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are
+//! [`keyframe`]s the joint estimate then has the last word on the pose, on the odometry's errors and on the lines, a few
+//! scans later.
 //!
 //! [`Slam::process_scan`](slam::Slam::process_scan) is that drawing; each stage is a module of its own and can be used
 //! without it.
@@ -26,8 +27,8 @@
 //! Times are those of the middle beam of a scan.
 //!
 //! # Reading order
-//! [`mapper`] for what a firmware holds, [`slam`] for the whole, [`segment`] for what a line is, then the stages in the order of the drawing. [`config`] has
-//! every constant and where it comes from.
+//! [`mapper`] for what a firmware holds, [`slam`] for the whole, [`segment`] for what a line is, then the stages in the
+//! order of the drawing. [`config`] has every constant and where it comes from.
 //!
 //! # Example
 //! ```

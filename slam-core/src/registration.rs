@@ -47,8 +47,8 @@ pub struct JointConfig {
     pub max_taken: u8,
     /// Most of those from which everything learns; from the others only the robot and the line that was seen.
     pub max_learning: u8,
-    /// Most sightings that are taken in during one scan, so that none takes long. They begin with the scan after the keyframe; where
-    /// keyframes follow each other, all are taken in at once.
+    /// Most sightings that are taken in during one scan, so that none takes long. They begin with the scan after the
+    /// keyframe; where keyframes follow each other, all are taken in at once.
     pub taken_per_scan: u8,
     /// A number that would tell less than this is passed over: variance of what it measures, over its own.
     pub least_gain: f32,
@@ -56,8 +56,8 @@ pub struct JointConfig {
     pub max_chi2: f32,
     /// A pair that fits worse than this χ² counts for less: its variance grows with its χ².
     pub kernel_chi2: f32,
-    /// A segment seen in fewer scans than this is young. A young one that is seen only now and then may be walking, or nothing:
-    /// the pose learns nothing from it.
+    /// A segment seen in fewer scans than this is young. A young one that is seen only now and then may be walking, or
+    /// nothing: the pose learns nothing from it.
     pub young_hits: u16,
     /// Now and then: in fewer than one of so many scans since it was first seen.
     pub young_scans_per_hit: f32,
@@ -197,13 +197,14 @@ impl Start<'_> {
 
 /// The sightings of a keyframe on their way into the joint estimate of the pose, the odometry's errors and the lines.
 ///
-/// The estimate stays at the keyframe until all are taken in, and the map as it was; then pose and lines move at once. What is
-/// new enters the map with the keyframe, and the estimate at the end.
+/// The estimate stays at the keyframe until all are taken in, and the map as it was; then pose and lines move at once.
+/// What is new enters map and estimate at the end.
 #[derive(Clone, Debug, Default)]
 pub struct Sightings {
     /// In the order of the scan.
     list: Vec<Sighting, MAX_TAKEN>,
-    /// Segments that go on beyond the ends of theirs in the map: the place of that among the lines, and both ends in `base`.
+    /// Segments that go on beyond the ends of theirs in the map: the place of that among the lines, and both ends in
+    /// `base`.
     longer: Vec<(usize, [Point2<f32>; 2]), MAX_LONGER>,
     /// How many of them have been taken in.
     taken: usize,
@@ -326,11 +327,11 @@ impl Sightings {
         self.taken > begin
     }
 
-    /// Takes in what is left, moves pose and lines, and fuses walls. Returns the keyframe's pose as it was thought to be, and as it is; in
-    /// `near` the map segments around it. `None` where there is nothing to settle.
+    /// Takes in what is left, moves pose and lines, and fuses walls. Returns the keyframe's pose as it was thought to be,
+    /// and as it is; in `near` the map segments around it. `None` where there is nothing to settle.
     ///
-    /// Work: for the lines tracked one step each; for each new segment the number of states tracked; for fusing, one step for each map segment that was seen and each one
-    /// around the robot, and one for each map segment.
+    /// Work: for the lines tracked one step each; for each new segment the number of states tracked; for fusing, one step
+    /// for each map segment that was seen and each one around the robot, and one for each map segment.
     pub fn settle<const N: usize>(
         &mut self,
         eye: &Eye,
@@ -367,8 +368,8 @@ impl Sightings {
     }
 }
 
-/// How many pairs tell more than one of them, which must tell something. Taken in in that order, those that are least known, and may be
-/// wrong, would come first: the order stays that of the scan.
+/// How many pairs tell more than one of them, which must tell something. Taken in in that order, those that are least
+/// known, and may be wrong, would come first: the order stays that of the scan.
 fn rank(gains: &[Option<f32>], index: usize) -> Option<usize> {
     let gain = gains.get(index).copied().flatten()?;
     let more =
