@@ -9,7 +9,7 @@ use core::mem::MaybeUninit;
 use core::ptr::{addr_of, addr_of_mut};
 use core::sync::atomic::{Ordering, compiler_fence};
 
-use crc::{CRC_32_ISO_HDLC, Crc, Table};
+use fletcher::calc_fletcher64;
 use slam_core::ConfigError;
 
 use crate::robot;
@@ -22,7 +22,7 @@ pub const SAMPLES: usize = 64;
 /// The map, the pose and the odometry.
 pub type Mapper = slam_core::Mapper<SEGMENTS, SAMPLES>;
 
-const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);
+const WORD: usize = size_of::<u32>();
 const MAGIC: u32 = 0x4C53_4C4D;
 const OPEN: u32 = 0x4F50_454E;
 const SEALED: u32 = 0x5345_414C;
@@ -43,9 +43,9 @@ pub enum Found {
 #[repr(C)]
 struct Seal {
     magic: u32,
-    firmware: u32,
     open: u32,
-    checksum: u32,
+    firmware: u64,
+    checksum: u64,
 }
 
 #[repr(C)]
@@ -125,22 +125,23 @@ impl Keeper {
 /// `mapper` must point to the store's mapper, which nothing may write meanwhile. Its bytes may be whatever power-up left:
 /// they lie in RAM that has been there all along, so that each has a value, and the black box keeps the compiler from
 /// thinking otherwise.
-unsafe fn checksum(mapper: *const MaybeUninit<Mapper>) -> u32 {
-    let bytes = core::hint::black_box(mapper.cast::<u8>());
-    // SAFETY: these are the mapper's bytes.
-    CRC.checksum(unsafe { core::slice::from_raw_parts(bytes, Mapper::BYTES) })
+unsafe fn checksum(mapper: *const MaybeUninit<Mapper>) -> u64 {
+    const { assert!(align_of::<Mapper>() >= align_of::<u32>() && Mapper::BYTES.is_multiple_of(WORD)) };
+    let words = core::hint::black_box(mapper.cast::<u32>());
+    // SAFETY: these are the mapper's words.
+    calc_fletcher64(unsafe { core::slice::from_raw_parts(words, Mapper::BYTES / WORD) })
 }
 
 /// Checksum of this firmware's code and constants, which lie side by side.
-fn firmware_checksum() -> u32 {
+fn firmware_checksum() -> u64 {
     unsafe extern "C" {
-        static __stext: u8;
-        static __erodata: u8;
+        static __stext: u32;
+        static __erodata: u32;
     }
     let (from, to) = (addr_of!(__stext), addr_of!(__erodata));
-    // SAFETY: the linker puts code and constants between these two, and nobody writes them.
-    let code = unsafe { core::slice::from_raw_parts(from, to.addr() - from.addr()) };
-    CRC.checksum(code)
+    // SAFETY: the linker puts code and constants between these two, at whole words, and nobody writes them.
+    let code = unsafe { core::slice::from_raw_parts(from, (to.addr() - from.addr()) / WORD) };
+    calc_fletcher64(code)
 }
 
 /// The wheels' ticks, twice, so that a reset while one is written leaves the other.

@@ -28,6 +28,8 @@ include!(concat!(env!("OUT_DIR"), "/set.rs"));
 const CAPACITY: usize = 512;
 /// Segments known at the start of a run.
 const KNOWN: [usize; 3] = [50, 200, 500];
+/// Turns of a loop counted by hand.
+const TURNS: u32 = 1000;
 /// Times that a function is called.
 const CALLS: u32 = 64;
 
@@ -103,42 +105,57 @@ fn count(work: impl FnOnce()) -> u32 {
     DWT::cycle_count().wrapping_sub(start).wrapping_sub(empty)
 }
 
-/// Loops whose instructions were counted by hand.
+/// Prints what a loop of r0 turns costs. It may change r2, lr, the flags and s0 to s7; r1 points to four words. It begins with a
+/// line of the flash.
+macro_rules! kernel {
+    ($name:literal, $($line:literal),+) => {{
+        let words = [0.0f32; 4];
+        let counted = count(|| {
+            // SAFETY: changes only what is named here, and reads only the words.
+            unsafe {
+                core::arch::asm!(
+                    ".p2align 4", $($line,)+
+                    inout("r0") TURNS => _, in("r1") words.as_ptr(), out("r2") _, out("lr") _,
+                    out("s0") _, out("s1") _, out("s2") _, out("s3") _,
+                    out("s4") _, out("s5") _, out("s6") _, out("s7") _,
+                );
+            }
+        });
+        defmt::println!("kernel {=str} {=u32} {=u32}", $name, TURNS, counted);
+    }};
+}
+
+/// Loops whose instructions and cycles were counted by hand, in `emulator/src/bench.rs`.
 fn kernels() {
-    const TURNS: u32 = 1000;
-    let adds = count(|| {
-        // SAFETY: changes only its own registers and the flags.
-        unsafe {
-            core::arch::asm!(
-                "2:", "vadd.f32 s0, s0, s1", "vadd.f32 s2, s2, s1", "subs {n}, #1", "bne 2b",
-                n = inout(reg) TURNS => _, out("s0") _, out("s1") _, out("s2") _,
-            );
-        }
-    });
-    let divisions = count(|| {
-        // SAFETY: as above.
-        unsafe {
-            core::arch::asm!(
-                "2:", "vdiv.f32 s0, s1, s1", "subs {n}, #1", "bne 2b",
-                n = inout(reg) TURNS => _, out("s0") _, out("s1") _,
-            );
-        }
-    });
-    let words = [0.0f32; 4];
-    let loads = count(|| {
-        // SAFETY: reads four words that are there.
-        unsafe {
-            core::arch::asm!(
-                "2:", "vldr s0, [{p}]", "vldr s1, [{p}, #4]", "vldr s2, [{p}, #8]", "vldr s3, [{p}, #12]",
-                "subs {n}, #1", "bne 2b",
-                p = in(reg) words.as_ptr(), n = inout(reg) TURNS => _,
-                out("s0") _, out("s1") _, out("s2") _, out("s3") _,
-            );
-        }
-    });
-    defmt::println!("kernel adds {=u32} {=u32}", TURNS, adds);
-    defmt::println!("kernel divisions {=u32} {=u32}", TURNS, divisions);
-    defmt::println!("kernel loads {=u32} {=u32}", TURNS, loads);
+    kernel!("adds", "2:", "vadd.f32 s0, s0, s1", "vadd.f32 s2, s2, s1", "subs r0, #1", "bne 2b");
+    kernel!("dependent", "2:", "vadd.f32 s0, s0, s1", "vadd.f32 s0, s0, s1", "subs r0, #1", "bne 2b");
+    kernel!("divisions", "2:", "vdiv.f32 s0, s1, s1", "subs r0, #1", "bne 2b");
+    kernel!("multiply", "2:", "vmla.f32 s0, s1, s1", "subs r0, #1", "bne 2b");
+    kernel!(
+        "loads",
+        "2:",
+        "ldr r2, [r1]",
+        "ldr r2, [r1, #4]",
+        "ldr r2, [r1, #8]",
+        "vldr s3, [r1, #12]",
+        "subs r0, #1",
+        "bne 2b"
+    );
+    kernel!("addresses", "2:", "adds r2, r1, #0", "ldr r2, [r2]", "subs r0, #1", "bne 2b");
+    kernel!("lists", "2:", "push {{r4-r7}}", "pop {{r4-r7}}", "subs r0, #1", "bne 2b");
+    kernel!("calls", "b 2f", ".p2align 4", "3:", "bx lr", "nop", "2:", "bl 3b", "subs r0, #1", "bne 2b");
+    kernel!(
+        "lines",
+        "2:",
+        ".rept 6",
+        "vadd.f32 s0, s4, s5",
+        "vadd.f32 s1, s4, s5",
+        "vadd.f32 s2, s4, s5",
+        "vadd.f32 s3, s4, s5",
+        ".endr",
+        "subs r0, #1",
+        "bne 2b"
+    );
 }
 
 /// Each transcendental function that the core uses or might, of libm or its own, beside micromath's.

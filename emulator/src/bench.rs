@@ -1,4 +1,4 @@
-//! The benchmark firmware's run, and what it counted.
+//! The benchmark firmware's runs, and what they counted: instructions, and the cycles that the model makes of them.
 
 use std::path::Path;
 
@@ -10,8 +10,10 @@ use rigless::session::Session;
 use rigless::time::VirtualNanos;
 use slam_core::slam::Stage;
 
-use crate::board::Nucleo;
+use crate::board::{CLOCK_HZ, CYCLES_PER_100_INSTRUCTIONS, Nucleo};
+use crate::cycles::{Cause, Program};
 use crate::firmware::{Log, LogLine, Symbols};
+use crate::paced::Pace;
 
 /// The clock of the part after a reset. At as many instructions a second, the cycle counter counts instructions.
 const RESET_HZ: u64 = 16_000_000;
@@ -24,6 +26,41 @@ const LONGEST_US: u64 = 3_600_000_000;
 /// About 2 % and 4 % of the time between two scans.
 const BUDGET: [u32; 2] = [250_000, 500_000];
 const BUDGET_SEGMENTS: usize = 200;
+/// Between two scans.
+const SCAN_S: f64 = 0.1;
+
+/// Loops counted by hand, with what [`crate::cycles`] says of their kind of instruction: instructions and cycles of a turn. The
+/// last two of each are `subs` and the branch back, one cycle and two.
+const KERNELS: [(&str, u32, u32); 9] = [
+    ("adds", 2 + 2, 2 + 3),
+    // The second waits for the first.
+    ("dependent", 2 + 2, 3 + 3),
+    ("divisions", 1 + 2, 14 + 3),
+    ("multiply", 1 + 2, 3 + 3),
+    // Two for the first, one for each that follows it.
+    ("loads", 4 + 2, 5 + 3),
+    // The load waits for its address.
+    ("addresses", 2 + 2, 1 + 3 + 3),
+    // Four registers to the stack and back.
+    ("lists", 2 + 2, 5 + 5 + 3),
+    // There two, back three.
+    ("calls", 2 + 2, 2 + 3 + 3),
+    // 24 instructions of four bytes: each of the six lines after the first comes two cycles late.
+    ("lines", 24 + 2, 24 + 6 * 2 + 3),
+];
+/// How far the cycles of an instruction may be from what the emulated board assumes.
+const PACE_TOLERANCE: f64 = 0.1;
+
+/// Both counts.
+#[derive(Debug)]
+pub struct Report {
+    /// On a core whose every instruction takes one cycle.
+    instructions: Measured,
+    /// On one that takes its time; the default configuration only.
+    cycles: Measured,
+    /// What the cycles went into.
+    pace: Pace,
+}
 
 /// All that was counted.
 #[derive(Debug, Default)]
@@ -78,13 +115,22 @@ impl Counted {
     }
 }
 
-/// Runs the firmware to its end.
-pub fn run(path: &Path, show: bool) -> anyhow::Result<Measured> {
+/// Runs the firmware on both cores.
+pub fn run(path: &Path, show: bool) -> anyhow::Result<Report> {
     let elf = std::fs::read(path).with_context(|| path.display().to_string())?;
+    let pace = Pace::new(Program::read(&elf, path)?);
+    let instructions = measure(path, elf.clone(), show, None)?;
+    let cycles = measure(path, elf, show, Some(&pace))?;
+    Ok(Report { instructions, cycles, pace })
+}
+
+/// Runs it to its end; with a pace until the default configuration is measured.
+fn measure(path: &Path, elf: Vec<u8>, show: bool, pace: Option<&Pace>) -> anyhow::Result<Measured> {
     let rtt = Symbols::rtt(&elf, path)?;
-    let board = Nucleo::bare(RESET_HZ)?;
+    let board = Nucleo::bare(RESET_HZ, pace.cloned())?;
     let session = Session::new(Box::new(board), 0, VirtualNanos(GRID_US * 1000))?;
-    let reader = Reader { log: Log::new(&elf, path, rtt)?, lines: Vec::new(), show, failure: None };
+    let end = if pace.is_some() { "run paper" } else { "end of benchmark" };
+    let reader = Reader { log: Log::new(&elf, path, rtt)?, lines: Vec::new(), show, end, failure: None };
     let images = [Image::new(path, elf, None)?];
     let mut finished = emulator::run(session, &Start::new(&images), reader)?;
     if let Some(error) = finished.driver.failure.take() {
@@ -94,7 +140,7 @@ pub fn run(path: &Path, show: bool) -> anyhow::Result<Measured> {
         return Err(error.into());
     }
     let mut measured = Measured::default();
-    for line in &finished.driver.lines {
+    for line in finished.driver.lines.iter().take_while(|line| !line.text.starts_with(end)) {
         measured.take(&line.text).with_context(|| format!("the firmware says: {}", line.text))?;
     }
     Ok(measured)
@@ -105,6 +151,8 @@ struct Reader {
     log: Log,
     lines: Vec<LogLine>,
     show: bool,
+    /// What the last line begins with.
+    end: &'static str,
     failure: Option<anyhow::Error>,
 }
 
@@ -118,7 +166,7 @@ impl Driver<Nucleo> for Reader {
         for line in self.lines.iter().skip(before).filter(|_| self.show) {
             println!("{line}");
         }
-        if self.lines.last().is_some_and(|l| l.text == "end of benchmark") {
+        if self.lines.iter().skip(before).any(|l| l.text.starts_with(self.end)) {
             return None;
         }
         if stop.at.0 / 1000 > LONGEST_US {
@@ -167,18 +215,13 @@ impl Measured {
                 };
                 self.runs.last_mut().context("a scan before its run")?.scans.push(scan);
             }
-            "end" => {}
             _ => bail!("this is no line of the benchmark"),
         }
         Ok(())
     }
 
-    /// Prints all of it, and fails over the budget.
-    pub fn print(&self) -> anyhow::Result<()> {
-        println!(
-            "instructions for each scan of {} scans, median / p99 / max",
-            self.runs.first().map_or(0, |r| r.scans.len())
-        );
+    /// Prints a line of percentiles for each run.
+    fn print_stages(&self) {
         let mut table = Table::new();
         table.load_style(presets::NOTHING);
         let stages = Stage::ALL.map(|s| format!("{s:?}").to_lowercase());
@@ -194,6 +237,9 @@ impl Measured {
             table.add_row(row);
         }
         println!("{table}");
+    }
+
+    fn print_scans(&self) {
         for run in &self.runs {
             let n = run.scans.len() as f64;
             let points = run.scans.iter().map(|s| f64::from(s.points)).sum::<f64>() / n;
@@ -212,30 +258,100 @@ impl Measured {
                 run.scans.last().map_or(0, |s| s.segments)
             );
         }
-        println!("\nfunction: instructions and largest error of libm (sin_cos: of the core), of micromath");
-        for Function { name, instructions: [ours, micromath], errors: [error, micromath_error] } in
-            &self.functions
-        {
-            println!("{name:<8} {ours:>6} {error:>8.1e} {micromath:>6} {micromath_error:>8.1e}");
-        }
-        println!("\nloops counted by hand: turns, instructions");
-        for (name, turns, instructions) in &self.kernels {
-            println!("{name:<10} {turns} {instructions}");
-        }
+    }
+
+    /// Median and 99th percentile of the run that has a budget.
+    fn budgeted(&self) -> anyhow::Result<[u32; 2]> {
         let run = self.runs.iter().find(|r| r.name == "default" && r.known == BUDGET_SEGMENTS);
         let [median, p99, _] =
             run.context("the run that has a budget is missing")?.percentiles(Counted::total);
+        Ok([median, p99])
+    }
+
+    /// What a loop costs for each turn.
+    fn turn(&self, name: &str) -> anyhow::Result<u32> {
+        let kernel = self.kernels.iter().find(|(kernel, _, _)| kernel == name);
+        kernel.map(|(_, turns, count)| count / turns).with_context(|| format!("the loop {name} is missing"))
+    }
+}
+
+impl Report {
+    /// Prints all of it. Fails over the budget, and where a count is not the one by hand.
+    pub fn print(&self) -> anyhow::Result<()> {
+        let Self { instructions, cycles, .. } = self;
+        let scans = instructions.runs.first().map_or(0, |r| r.scans.len());
+        println!("instructions for each scan of {scans} scans, median / p99 / max");
+        instructions.print_stages();
+        instructions.print_scans();
+        println!("\ncycles for each of them by the model, median / p99 / max");
+        cycles.print_stages();
+        let strange = self.print_causes();
+        println!("\nfunction: instructions and largest error of libm (sin_cos: of the core), of micromath");
+        for Function { name, instructions: [ours, micromath], errors: [error, micromath_error] } in
+            &instructions.functions
+        {
+            println!("{name:<8} {ours:>6} {error:>8.1e} {micromath:>6} {micromath_error:>8.1e}");
+        }
+        let wrong = self.print_kernels()?;
+        let [median, p99] = instructions.budgeted()?;
         println!(
-            "\ndefault, {BUDGET_SEGMENTS} segments: median {median}, p99 {p99}; {} and {} are allowed",
+            "\ndefault, {BUDGET_SEGMENTS} segments: median {median}, p99 {p99} instructions; {} and {} are allowed",
             BUDGET[0], BUDGET[1]
         );
+        let share = |count: u32| 100.0 * f64::from(count) / (CLOCK_HZ.get() as f64 * SCAN_S);
+        let timed = cycles.budgeted()?;
+        println!(
+            "in cycles {} and {}: {:.1} % and {:.1} % of the time between two scans at {} MHz",
+            timed[0],
+            timed[1],
+            share(timed[0]),
+            share(timed[1]),
+            CLOCK_HZ.get() / 1_000_000
+        );
+        ensure!(wrong.is_empty(), "these loops do not cost what they cost by hand: {}", wrong.join(", "));
+        ensure!(strange == 0, "{strange} instructions are not in the disassembled code");
         ensure!(
             median <= BUDGET[0] && p99 <= BUDGET[1],
             "a scan takes {median} instructions at the median and {p99} at the 99th percentile; {} and {} are allowed",
             BUDGET[0],
             BUDGET[1]
         );
+        let assumed = CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0;
+        let counted = self.pace.tally.cycles_per_instruction();
+        ensure!(
+            (counted / assumed - 1.0).abs() <= PACE_TOLERANCE,
+            "an instruction takes {counted:.2} cycles here; the emulated board assumes {assumed:.2}"
+        );
         Ok(())
+    }
+
+    /// Prints what the cycles went into; returns the instructions that the model does not know.
+    fn print_causes(&self) -> u64 {
+        let tally = &self.pace.tally;
+        let count = tally.of(Cause::Instructions) as f64;
+        let causes = Cause::CYCLES
+            .map(|cause| format!("{cause:?} {:.3}", tally.of(cause) as f64 / count).to_lowercase());
+        println!(
+            "cycles of an instruction: {:.3} ({}); {:.2} on the emulated board",
+            tally.cycles_per_instruction(),
+            causes.join(", "),
+            CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0
+        );
+        tally.of(Cause::Unknown)
+    }
+
+    /// Prints the loops counted by hand; returns those that cost something else.
+    fn print_kernels(&self) -> anyhow::Result<Vec<&'static str>> {
+        println!("\nloops, of each turn: instructions and cycles by hand, instructions and cycles counted");
+        let mut wrong = Vec::new();
+        for (name, instructions, cycles) in KERNELS {
+            let counted = (self.instructions.turn(name)?, self.cycles.turn(name)?);
+            println!("{name:<10} {instructions:>2} {cycles:>2}   {:>2} {:>2}", counted.0, counted.1);
+            if counted != (instructions, cycles) {
+                wrong.push(name);
+            }
+        }
+        Ok(wrong)
     }
 }
 

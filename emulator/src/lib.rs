@@ -5,8 +5,10 @@
 
 pub mod bench;
 pub mod board;
+pub mod cycles;
 pub mod fault;
 pub mod firmware;
+pub mod paced;
 pub mod record;
 pub mod report;
 pub mod room;

@@ -45,6 +45,9 @@ struct Cli {
     /// Change an error of the simulated robot, as in `lineslam simulate`.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
+    /// Have each instruction take as many cycles as the model of the core says. Takes ten times as long.
+    #[arg(long)]
+    cycles: bool,
     /// Print the firmware's log as it comes.
     #[arg(long)]
     log: bool,
@@ -80,6 +83,7 @@ fn emulate(cli: &Cli) -> anyhow::Result<()> {
         seed: cli.seed,
         seconds: cli.seconds,
         faults: cli.faults.clone(),
+        cycles: cli.cycles,
     };
     let bar = progress_bar();
     let (shown, with_log) = (bar.clone(), cli.log);
@@ -196,7 +200,14 @@ fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
             ),
         ),
         ("resets, warnings", format!("{}, {}", r.resets, r.warnings)),
-        ("instructions", format!("{:.0} million", outcome.instructions as f64 * 1e-6)),
+        (
+            "instructions",
+            format!(
+                "{:.0} million, of {:.2} cycles by the model",
+                outcome.instructions as f64 * 1e-6,
+                r.cycles_per_instruction
+            ),
+        ),
         ("written to", out.display().to_string()),
     ];
     let mut table = Table::new();

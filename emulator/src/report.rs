@@ -59,6 +59,8 @@ pub struct Report {
     pub static_bytes: u64,
     /// Instructions executed.
     pub instructions: u64,
+    /// Cycles of one of them: by the model, or assumed of all.
+    pub cycles_per_instruction: f64,
 }
 
 /// The run as a drive with its truth, scan by scan.
@@ -134,6 +136,7 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
         stack_bytes: stack_bytes(outcome),
         static_bytes: outcome.static_bytes,
         instructions: outcome.instructions,
+        cycles_per_instruction: outcome.cycles_per_instruction,
     };
     Ok(Judged { drive, poses, map, report })
 }

@@ -13,9 +13,13 @@ use rigless::image::Image;
 use rigless::session::Session;
 use rigless::time::VirtualNanos;
 
-use crate::board::{Nucleo, Shared, TIME_DRIVER_EGR, URG_BRR};
+use crate::board::{
+    CYCLES_PER_100_INSTRUCTIONS, FLASH_ACCELERATED, FLASH_ACR, Nucleo, Shared, TIME_DRIVER_EGR, URG_BRR,
+};
+use crate::cycles::{Cause, Program};
 use crate::fault::Fault;
 use crate::firmware::{Log, LogLine, Symbols};
+use crate::paced::Pace;
 use crate::record::{Entry, Recorder};
 use crate::room::{Building, Edge, Room, TrueScan};
 
@@ -48,6 +52,8 @@ pub struct Plan<'a> {
     pub seconds: Option<u64>,
     /// What goes wrong.
     pub faults: Vec<Fault>,
+    /// Whether each instruction takes as many cycles as the model of the core says, and not as many as all others.
+    pub cycles: bool,
 }
 
 /// What there is to see while it runs.
@@ -88,10 +94,14 @@ pub struct Outcome {
     pub resets: Vec<(u64, String)>,
     /// Times that the LED was switched.
     pub led_changes: u32,
+    /// Whether the flash's accelerator was on at the end.
+    pub flash_accelerated: bool,
     /// Bytes of the firmware's variables.
     pub static_bytes: u64,
     /// Instructions executed.
     pub instructions: u64,
+    /// By the model, or assumed.
+    pub cycles_per_instruction: f64,
     /// Virtual time at the end, microseconds.
     pub end_us: u64,
     /// Whether the path was driven to its end.
@@ -108,7 +118,8 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         fault.prepare(&mut room, plan.seed);
     }
     let shared: Shared = Arc::new(Mutex::new(room));
-    let mut board = Nucleo::new(shared.clone())?;
+    let pace = plan.cycles.then(|| Program::read(&elf, plan.elf).map(Pace::new)).transpose()?;
+    let mut board = Nucleo::new(shared.clone(), pace.clone())?;
     for fault in &plan.faults {
         fault.prepare_board(&mut board, plan.seed);
     }
@@ -128,6 +139,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         resets: 0,
         led: false,
         led_changes: 0,
+        flash_accelerated: false,
         see: Box::new(see),
         failure: None,
     };
@@ -153,8 +165,11 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         console: String::from_utf8_lossy(&room.console).into_owned(),
         resets,
         led_changes: director.led_changes,
+        flash_accelerated: director.flash_accelerated,
         static_bytes: symbols.static_bytes,
-        instructions: stop.instruction_count,
+        instructions: pace.as_ref().map_or(stop.instruction_count, |p| p.tally.of(Cause::Instructions)),
+        cycles_per_instruction: pace
+            .map_or(CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0, |p| p.tally.cycles_per_instruction()),
         end_us: stop.at.0 / 1000,
         arrived: room.building.arrived(),
     })
@@ -176,6 +191,7 @@ struct Director {
     resets: usize,
     led: bool,
     led_changes: u32,
+    flash_accelerated: bool,
     see: Box<dyn FnMut(Seen) + Send>,
     failure: Option<anyhow::Error>,
 }
@@ -194,6 +210,7 @@ impl Driver<Nucleo> for Director {
                     room.host_rate = rate;
                 }
             }
+            FLASH_ACR => self.flash_accelerated = access.value & FLASH_ACCELERATED == FLASH_ACCELERATED,
             _ => {}
         }
     }

@@ -2,7 +2,8 @@
 
 mod common;
 
-use common::{hall, last_error_m, nothing_lost, robot, run_in, says, scans};
+use common::{hall, hall_in_cycles, last_error_m, nothing_lost, robot, run_in, says, scans};
+use emulator::board::CYCLES_PER_100_INSTRUCTIONS;
 use emulator::record::Event;
 use emulator::report::first_difference;
 
@@ -27,6 +28,7 @@ fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
     let poses = outcome.console.lines().filter(|l| l.split(' ').count() == 8).count();
     assert!(poses * 100 >= report.scans_used * 95, "{poses} of {}", report.scans_used);
     assert!(outcome.led_changes > 100);
+    assert!(outcome.flash_accelerated);
     // Variables and stack, of the executor in thread mode with all interrupts on top.
     let [stack, thread, urgent] = report.stack_bytes;
     assert!(thread > 2000 && urgent > 200, "{thread} {urgent}");
@@ -47,6 +49,17 @@ fn the_board_and_the_pc_agree_bit_for_bit_over_sixty_seconds() {
         ranges_mm.iter_mut().for_each(|r| *r += 1);
     }
     assert!(first_difference(&entries, &robot()).unwrap().is_some());
+}
+
+#[test]
+fn a_core_that_takes_its_time_does_the_same_in_the_time_that_is_assumed() {
+    let (outcome, judged) = hall_in_cycles(Some(20));
+    assert!(judged.report.scans_used > 160, "{}", judged.report.scans_used);
+    assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None);
+    assert!(nothing_lost(&outcome));
+    let assumed = CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0;
+    let counted = outcome.cycles_per_instruction;
+    assert!((counted / assumed - 1.0).abs() < 0.1, "{counted} cycles an instruction; {assumed} are assumed");
 }
 
 #[test]

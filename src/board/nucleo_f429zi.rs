@@ -108,6 +108,7 @@ pub enum ResetCause {
 pub fn start() -> (Board, ResetCause) {
     let cause = reset_cause();
     let p = embassy_stm32::init(clocks());
+    accelerate_flash();
     // The firmware's own urgent work comes after what the hardware cannot hold back, bytes and time.
     interrupt::UART5.set_priority(Priority::P6);
     let board = Board {
@@ -147,6 +148,16 @@ fn clocks() -> Config {
     config.rcc.apb1_pre = APBPrescaler::DIV4;
     config.rcc.apb2_pre = APBPrescaler::DIV2;
     config
+}
+
+/// Has code and constants read ahead and kept: at 180 MHz the flash makes the core wait five cycles for each 16 bytes that it
+/// has not. Setting the clocks leaves the accelerator off.
+fn accelerate_flash() {
+    pac::FLASH.acr().modify(|w| {
+        w.set_prften(true);
+        w.set_icen(true);
+        w.set_dcen(true);
+    });
 }
 
 /// Reads the reset flags and clears them for the next time. A power-up sets the pin's flag too.

@@ -9,6 +9,8 @@ use crate::run::{cargo, ensure_target, is_installed, program, step, target_folde
 
 /// What probe-rs calls the default board's chip.
 const CHIP: &str = "STM32F429ZITx";
+/// What to build for the emulator, and how. The emulated part asks for a newer compiler than it needs.
+pub const EMULATOR: &str = "--profile emulator -p emulator --ignore-rust-version";
 /// Where finished ELF files are put, under the target folder.
 const ELF_FOLDER: &str = "firmware";
 
@@ -81,7 +83,7 @@ fn probe_rs(what: &str, elf: &Path) -> anyhow::Result<()> {
 pub fn emulate(arguments: &[String]) -> anyhow::Result<()> {
     let elf = build(Build::Flashed)?;
     build_emulator()?;
-    let mut command = program(target_folder().join("release/emulator"));
+    let mut command = program(target_folder().join("emulator/emulator"));
     command.arg("--firmware").arg(elf).args(arguments);
     let status = command.status().context("cannot run the emulator")?;
     if !status.success() {
@@ -117,14 +119,13 @@ fn bench_command() -> anyhow::Result<std::process::Command> {
     let command = format!("build --quiet --release -p bench-target --target {TARGET}");
     step("benchmark firmware", &mut cargo(&command))?;
     build_emulator()?;
-    let mut command = program(target_folder().join("release/bench"));
+    let mut command = program(target_folder().join("emulator/bench"));
     command.arg("--firmware").arg(target_folder().join(TARGET).join("release/bench-target"));
     Ok(command)
 }
 
 fn build_emulator() -> anyhow::Result<()> {
-    // The emulated part asks for a newer compiler than it needs.
-    step("emulator", &mut cargo("build --release -p emulator --ignore-rust-version"))
+    step("emulator", &mut cargo(&format!("build {EMULATOR}")))
 }
 
 /// Builds what the tests of the emulated board need, and says where it is.

@@ -50,9 +50,11 @@ pub fn report() -> anyhow::Result<()> {
     )?;
     writeln!(
         text,
-        "The loops have 4, 3 and 6 instructions a turn, counted by hand: so the counter counts. In cycles the emulated board takes \
-         1.25 for each instruction, an assumption for code of this kind with the flash accelerator on. It holds for no single kind \
-         of instruction (a division takes 14, most others one), and no silicon was measured.\n"
+        "Cycles are those of a model: what the manuals of core and part say of each kind of instruction, of branches, of what waits for \
+         what, and of the flash with its accelerator (`emulator/src/cycles.rs`, which also says what it leaves out). Each instruction \
+         executed is taken through it. The loops were counted by hand, and the benchmark fails where what it counts differs. No \
+         silicon was measured. `cargo xtask emulate --cycles` has the whole board take its time by the model; without, all its \
+         instructions take as long as the average one.\n"
     )?;
     writeln!(
         text,

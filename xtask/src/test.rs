@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 
+use crate::firmware::EMULATOR;
 use crate::run::{announce, cargo, ensure_target, program, root, step};
 use crate::{TARGET, bench, firmware, size};
 
@@ -14,8 +15,8 @@ pub fn everything() -> anyhow::Result<()> {
     ensure_target()?;
     step("format", &mut cargo("fmt --all --check"))?;
     step("clippy, host", &mut cargo("clippy --workspace --exclude emulator --all-targets -- -D warnings"))?;
-    let emulator = "clippy --release -p emulator --all-targets --ignore-rust-version -- -D warnings";
-    step("clippy, emulator", &mut cargo(emulator))?;
+    let emulator = format!("clippy {EMULATOR} --all-targets -- -D warnings");
+    step("clippy, emulator", &mut cargo(&emulator))?;
     for arguments in [
         "-p slam-core",
         "-p slam-core --features defmt,serde",
@@ -53,7 +54,7 @@ fn tests(python: Option<PathBuf>, elves: &[(&str, PathBuf)]) -> anyhow::Result<(
     }
     let on_the_pc = run_tests(&mut command, &mut sum)?;
     announce("tests on the emulated board");
-    let mut command = cargo("test --release -p emulator --ignore-rust-version --no-fail-fast");
+    let mut command = cargo(&format!("test {EMULATOR} --no-fail-fast"));
     command.envs(elves.iter().map(|(name, path)| (name, path)));
     let emulated = run_tests(&mut command, &mut sum)?;
     println!();

@@ -1,12 +1,13 @@
-//! `cargo xtask bench-target` runs this: a firmware that counts, on a core whose every instruction takes one cycle.
+//! `cargo xtask bench-target` runs this: a firmware that counts, on a core whose every instruction takes one cycle, and on one that
+//! takes as many as a Cortex-M4F.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use emulator::bench::{self, Measured};
+use emulator::bench;
 
-/// Runs the benchmark firmware on an emulated core and prints what it counted: instructions.
+/// Runs the benchmark firmware on an emulated core and prints what it counted: instructions, and cycles by a model.
 #[derive(Parser)]
 #[command(bin_name = "cargo xtask bench-target")]
 struct Cli {
@@ -20,7 +21,7 @@ struct Cli {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    match bench::run(&cli.firmware, cli.log).and_then(|measured: Measured| measured.print()) {
+    match bench::run(&cli.firmware, cli.log).and_then(|report| report.print()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");

@@ -42,11 +42,19 @@ pub fn hall(seconds: Option<u64>, faults: &[&str]) -> (Outcome, Judged) {
 
 /// Runs a build of the firmware in the hall.
 pub fn run_in(build: &str, seconds: Option<u64>, faults: &[&str]) -> (Outcome, Judged) {
-    let (world, robot, seed) = (world("hall"), robot(), 11);
     let faults = faults.iter().map(|f| f.parse::<Fault>().expect("a fault")).collect();
-    let elf = elf(build);
-    let plan =
-        Plan { elf: &elf, world: &world, robot: &robot, sim: SimConfig::default(), seed, seconds, faults };
+    run_at(build, seconds, faults, false)
+}
+
+/// Runs the firmware that is flashed in the hall, on a core that takes its time.
+pub fn hall_in_cycles(seconds: Option<u64>) -> (Outcome, Judged) {
+    run_at("lineslam", seconds, Vec::new(), true)
+}
+
+fn run_at(build: &str, seconds: Option<u64>, faults: Vec<Fault>, cycles: bool) -> (Outcome, Judged) {
+    let (world, robot, seed) = (world("hall"), robot(), 11);
+    let (elf, sim) = (elf(build), SimConfig::default());
+    let plan = Plan { elf: &elf, world: &world, robot: &robot, sim, seed, seconds, faults, cycles };
     let outcome = run(&plan, |_| ()).unwrap_or_else(|error| panic!("{error:#}"));
     let judged = report::judge(&world, seed, &outcome).expect("a run that can be judged");
     (outcome, judged)
