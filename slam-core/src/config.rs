@@ -167,8 +167,8 @@ impl SlamConfig {
             extraction: ExtractionConfig::Ransac(RansacConfig {
                 draws: 50,               // ours
                 inlier_distance_m: 0.03, // ours: the sensor's ±30 mm
-                max_gap_m: 0.3,          // ours
-                min_inliers: 10,         // ours
+                max_gap_m: 0.1,          // ours
+                min_inliers: 6,          // ours
                 seed: 1,
             }),
             line_noise: LineNoise { sigma_offset_m: 0.0, sigma_direction_rad: 0.0 },

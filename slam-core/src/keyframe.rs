@@ -6,8 +6,9 @@
 //! stands. The pose of every other scan is corrected against the map as the last keyframe left it, by fewer beams; and
 //! while the robot goes on, what the keyframe saw is taken in bit by bit, so that no scan takes long.
 
-use nalgebra::{Isometry2, Matrix3, Vector2};
+use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
+use crate::math::sqrt;
 use crate::odometry::Increment;
 use crate::pose::perpendicular;
 
@@ -36,12 +37,14 @@ pub(crate) struct Keyframe {
     pub since: Increment,
     /// Scans since.
     pub scans: u32,
+    /// Its own error among the lines around it.
+    pub among_lines: AmongLines,
 }
 
 impl Keyframe {
     /// A keyframe just taken.
-    pub fn at(map_from_base: Isometry2<f32>) -> Self {
-        Self { map_from_base, since: Increment::identity(), scans: 0 }
+    pub fn at(map_from_base: Isometry2<f32>, among_lines: AmongLines) -> Self {
+        Self { map_from_base, since: Increment::identity(), scans: 0, among_lines }
     }
 
     /// Whether the robot has gone on far enough for another one; `number` is that of the scan.
@@ -59,6 +62,29 @@ pub(crate) struct Settled {
     pub position: Vector2<f32>,
     /// Of the pose (x, y, θ).
     pub covariance: Matrix3<f32>,
+    /// What of that is the pose's own error among the lines around it.
+    pub among_lines: AmongLines,
+}
+
+/// Variances of a pose if the lines around it had none.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct AmongLines {
+    /// Of both coordinates, summed.
+    position: f32,
+    heading: f32,
+}
+
+impl AmongLines {
+    /// From the covariance (x, y, θ).
+    pub fn of(covariance: &Matrix3<f32>) -> Self {
+        Self { position: covariance.m11 + covariance.m22, heading: covariance.m33 }
+    }
+
+    /// With another covariance on top.
+    pub fn plus(self, covariance: &Matrix3<f32>) -> Self {
+        let by = Self::of(covariance);
+        Self { position: self.position + by.position, heading: self.heading + by.heading }
+    }
 }
 
 impl Settled {
@@ -68,6 +94,17 @@ impl Settled {
         let mut by_pose = Matrix3::identity();
         (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
         by_pose * self.covariance * by_pose.transpose()
+    }
+
+    /// What a pose's own error among the lines around it, of such a covariance, adds to what is carried: by how much it is
+    /// more than it was here.
+    pub fn grown(&self, covariance: &Matrix3<f32>) -> Matrix3<f32> {
+        let share = |before: f32, now: f32| if now > before { sqrt(1.0 - before / now) } else { 0.0 };
+        let (before, now) = (self.among_lines, AmongLines::of(covariance));
+        let position = share(before.position, now.position);
+        let heading = share(before.heading, now.heading);
+        let shares = Matrix3::from_diagonal(&Vector3::new(position, position, heading));
+        shares * covariance * shares
     }
 }
 
@@ -81,7 +118,7 @@ mod tests {
 
     #[test]
     fn it_is_due_at_the_start_after_a_way_after_a_turn_and_after_a_while() {
-        let mut last = Keyframe::at(Isometry2::identity());
+        let mut last = Keyframe::at(Isometry2::identity(), AmongLines::default());
         assert!(last.is_due(0, &CONFIG) && last.is_due(1, &CONFIG) && !last.is_due(2, &CONFIG));
         // Back and forth is a way too.
         for step in [0.06, -0.06] {
@@ -89,19 +126,29 @@ mod tests {
             last.since = last.since.then(&Increment::from_motion(pose(step, 0.0, 0.0)));
         }
         assert!(last.is_due(9, &CONFIG));
-        last = Keyframe::at(Isometry2::identity());
+        last = Keyframe::at(Isometry2::identity(), AmongLines::default());
         last.since = Increment::from_motion(pose(0.0, 0.0, -0.11));
         assert!(last.is_due(9, &CONFIG));
-        last = Keyframe { scans: 5, ..Keyframe::at(Isometry2::identity()) };
+        last = Keyframe { scans: 5, ..Keyframe::at(Isometry2::identity(), AmongLines::default()) };
         assert!(last.is_due(9, &CONFIG));
     }
 
     #[test]
     fn away_from_where_it_settled_the_heading_s_error_moves_the_robot() {
         let covariance = Matrix3::from_diagonal(&nalgebra::Vector3::new(1e-4, 1e-4, 4e-4));
-        let settled = Settled { position: Vector2::new(1.0, 1.0), covariance };
+        let settled = Settled { position: Vector2::new(1.0, 1.0), covariance, ..Settled::default() };
         let carried = settled.carried(&pose(3.0, 1.0, 0.0));
         assert!((carried.m22 - (1e-4 + 4.0 * 4e-4)).abs() < 1e-8 && (carried.m11 - 1e-4).abs() < 1e-8);
         assert!((carried.m23 - 2.0 * 4e-4).abs() < 1e-8);
+    }
+
+    #[test]
+    fn only_what_an_error_has_grown_by_is_added() {
+        let before = Matrix3::from_diagonal(&Vector3::new(1e-4, 3e-4, 1e-4));
+        let settled = Settled { among_lines: AmongLines::of(&before), ..Settled::default() };
+        assert_eq!(settled.grown(&before), Matrix3::zeros());
+        assert_eq!(settled.grown(&(before * 0.5)), Matrix3::zeros());
+        let grown = settled.grown(&(before * 4.0));
+        assert!((grown - before * 3.0).amax() < 1e-9, "{grown}");
     }
 }

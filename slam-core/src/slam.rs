@@ -14,7 +14,7 @@ use crate::correction::{
 use crate::deskew::{DeskewReport, ScanPoint, deskew};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
-use crate::keyframe::{Keyframe, Settled};
+use crate::keyframe::{AmongLines, Keyframe, Settled};
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, MapSegment, SegmentMap};
 use crate::math::{sqrt, within, wrap_angle};
@@ -202,7 +202,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             way_m: 0.0,
             closing: PendingClosure::default(),
             joint: None,
-            keyframe: Keyframe::at(Isometry2::identity()),
+            keyframe: Keyframe::at(Isometry2::identity(), AmongLines::default()),
             sightings: Sightings::default(),
             settled: Settled::default(),
             points: Vec::new(),
@@ -241,13 +241,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if self.joint.is_none() {
             return self.local_covariance;
         }
-        let carried = self.settled.carried(&self.map_from_base);
-        // The pose of a keyframe taken in is the joint estimate's; another has an error of its own among the lines around it.
-        if self.keyframe.scans == 0 && !self.sightings.wait() {
-            carried
-        } else {
-            carried + self.local_covariance
-        }
+        // What the walls that were seen have in common does not average out over many of them.
+        let in_common = self.config.line_noise.var_offset();
+        self.settled.carried(&self.map_from_base)
+            + self.settled.grown(&self.local_covariance)
+            + Matrix3::from_diagonal(&Vector3::new(in_common, in_common, 0.0))
     }
 
     /// Systematic errors of the odometry as learnt so far.
@@ -382,7 +380,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             joint.clear(sigmas);
         }
         self.sightings.clear();
-        self.keyframe = Keyframe::at(self.map_from_base);
+        self.keyframe = Keyframe::at(self.map_from_base, AmongLines::default());
         self.note_settled();
     }
 
@@ -390,6 +388,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if let Some(joint) = &mut self.joint {
             joint.loosen_pose(by, &mut self.map);
         }
+        self.keyframe.among_lines = self.keyframe.among_lines.plus(by);
         self.note_settled();
     }
 
@@ -397,7 +396,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     fn note_settled(&mut self) {
         if let Some(joint) = &self.joint {
             let position = self.keyframe.map_from_base.translation.vector;
-            self.settled = Settled { position, covariance: joint.pose_covariance() };
+            let covariance = joint.pose_covariance();
+            self.settled = Settled { position, covariance, among_lines: self.keyframe.among_lines };
         }
     }
 
@@ -682,7 +682,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             joint.predict(&moved.by_pose, &by_odometry, &moved.noise, &mut self.map);
         }
         // Of no scan yet: the pose may have been corrected since.
-        self.keyframe = Keyframe { scans: 1, ..Keyframe::at(moved.pose) };
+        let among_lines = AmongLines::of(&self.local_covariance);
+        self.keyframe = Keyframe { scans: 1, ..Keyframe::at(moved.pose, among_lines) };
         moved.pose
     }
 
@@ -711,7 +712,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         // A closed loop has moved the prediction with the map.
         let carried = update.closure.map(|closure| closure.closed * closure.drifted.inverse());
         let prior = carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced);
-        self.keyframe = Keyframe::at(prior);
+        self.keyframe = Keyframe::at(prior, AmongLines::of(&update.covariance));
         let start = Start { prior: &prior, pose: &update.pose };
         let seen =
             Observed { segments: &self.observed, pairs: &self.pairs, stamp: self.stamp(), eye: self.eye() };

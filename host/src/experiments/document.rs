@@ -276,13 +276,14 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
     say("## Why `paper` is not the paper's figure");
     say(&format!(
         "The paper does not state its thresholds (RANSAC draws, inlier distance, gap, gate of the association, when a system is\n\
-         singular), its speed, nor how good its odometry was; those of `SlamConfig::paper()` are ours. Its algorithm has no\n\
-         prior and no gate on direction: the pose is where the pairs pull it, every segment that agrees with a wrong pose\n\
-         becomes map, and what the map says is never doubted again. So its error grows with that of the wheels, which the\n\
-         pose goes back to wherever a scan fixes too little. With wheels as good as the robot file says, its trajectory error\n\
-         (rmse) is {} m in the hall and {} m in the corridor, beside the paper's corner errors of 0.067 m and 0.234 m; with\n\
-         wheels that are 1 % off it is {} m and {} m. Where corners are 0.35 m or more away from the blueprint's they are not\n\
-         found, so that the corner errors of `paper` are those of the few corners near the start.",
+         singular), its speed, nor how good its odometry was; those of `SlamConfig::paper()` are ours, set where it does best\n\
+         in hall and corridor, on other seeds. Its algorithm has no prior and no gate on direction: the pose is where the\n\
+         pairs pull it, every segment that agrees with a wrong pose becomes map, and what the map says is never doubted\n\
+         again. So its error grows with that of the wheels, which the pose goes back to wherever a scan fixes too little.\n\
+         With wheels as good as the robot file says, its trajectory error (rmse) is {} m in the hall and {} m in the\n\
+         corridor, beside the paper's corner errors of 0.067 m and 0.234 m; with wheels that are 1 % off it is {} m and {} m.\n\
+         Where corners are 0.35 m or more away from the blueprint's they are not found, so that the corner errors of `paper`\n\
+         are those of the few corners near the start.",
         paper_error(results, "hall", |r| r.paper_calibrated.as_ref()),
         paper_error(results, "corridor", |r| r.paper_calibrated.as_ref()),
         paper_error(results, "hall", |r| r.paper.as_ref()),
