@@ -10,7 +10,7 @@ use rigless::session::Session;
 use rigless::time::VirtualNanos;
 use slam_core::slam::Stage;
 
-use crate::board::{CLOCK_HZ, CYCLES_PER_100_INSTRUCTIONS, Nucleo};
+use crate::board::{CLOCK_HZ, CYCLES_PER_INSTRUCTION, Nucleo, check_assumed_cycles};
 use crate::cycles::{Cause, Program};
 use crate::firmware::{Log, LogLine, Symbols};
 use crate::paced::Pace;
@@ -23,7 +23,6 @@ const GRID_US: u64 = 1000;
 const LONGEST_US: u64 = 3_600_000_000;
 
 /// Instructions that a scan may take with the default configuration and [`BUDGET_SEGMENTS`] segments: median and 99th percentile.
-/// About 2 % and 4 % of the time between two scans.
 const BUDGET: [u32; 2] = [250_000, 500_000];
 const BUDGET_SEGMENTS: usize = 200;
 /// Between two scans.
@@ -48,8 +47,6 @@ const KERNELS: [(&str, u32, u32); 9] = [
     // 24 instructions of four bytes: each of the six lines after the first comes two cycles late.
     ("lines", 24 + 2, 24 + 6 * 2 + 3),
 ];
-/// How far the cycles of an instruction may be from what the emulated board assumes.
-const PACE_TOLERANCE: f64 = 0.1;
 
 /// Both counts.
 #[derive(Debug)]
@@ -65,7 +62,7 @@ pub struct Report {
 /// All that was counted.
 #[derive(Debug, Default)]
 pub struct Measured {
-    /// Loops counted by hand: name, turns, instructions.
+    /// Loops counted by hand: name, turns, instructions or cycles.
     pub kernels: Vec<(String, u32, u32)>,
     /// Transcendental functions.
     pub functions: Vec<Function>,
@@ -78,7 +75,7 @@ pub struct Measured {
 pub struct Function {
     /// What it computes.
     pub name: String,
-    /// Instructions of both.
+    /// Instructions or cycles of both.
     pub instructions: [u32; 2],
     /// Largest error of both, against libm in double precision.
     pub errors: [f32; 2],
@@ -98,7 +95,7 @@ pub struct Run {
 /// One scan.
 #[derive(Clone, Copy, Debug)]
 pub struct Counted {
-    /// Instructions of each stage.
+    /// Instructions or cycles of each stage.
     pub stages: [u32; Stage::COUNT],
     /// Points of the scan.
     pub points: u32,
@@ -109,7 +106,7 @@ pub struct Counted {
 }
 
 impl Counted {
-    /// Instructions of all stages.
+    /// Of all stages.
     pub fn total(&self) -> u32 {
         self.stages.iter().sum()
     }
@@ -316,13 +313,7 @@ impl Report {
             BUDGET[0],
             BUDGET[1]
         );
-        let assumed = CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0;
-        let counted = self.pace.tally.cycles_per_instruction();
-        ensure!(
-            (counted / assumed - 1.0).abs() <= PACE_TOLERANCE,
-            "an instruction takes {counted:.2} cycles here; the emulated board assumes {assumed:.2}"
-        );
-        Ok(())
+        check_assumed_cycles(self.pace.tally.cycles_per_instruction())
     }
 
     /// Prints what the cycles went into; returns the instructions that the model does not know.
@@ -332,10 +323,9 @@ impl Report {
         let causes = Cause::CYCLES
             .map(|cause| format!("{cause:?} {:.3}", tally.of(cause) as f64 / count).to_lowercase());
         println!(
-            "cycles of an instruction: {:.3} ({}); {:.2} on the emulated board",
+            "cycles of an instruction: {:.3} ({}); {CYCLES_PER_INSTRUCTION} on the emulated board",
             tally.cycles_per_instruction(),
-            causes.join(", "),
-            CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0
+            causes.join(", ")
         );
         tally.of(Cause::Unknown)
     }

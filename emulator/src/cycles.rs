@@ -244,7 +244,7 @@ fn bits(register: RegId) -> Registers {
 /// What cycles went into, over all that ran.
 #[derive(Debug, Default)]
 pub struct Tally {
-    counts: [AtomicU64; Cause::CYCLES.len() + 2],
+    counts: [AtomicU64; Cause::Exceptions as usize + 1],
 }
 
 /// What takes cycles, and how many instructions did.
@@ -252,7 +252,7 @@ pub struct Tally {
 pub enum Cause {
     /// Instructions, not cycles.
     Instructions,
-    /// Those that no table says anything about: not cycles either.
+    /// Those that are not in the decoded code: not cycles either.
     Unknown,
     /// What the core's tables say.
     Core,

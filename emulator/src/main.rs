@@ -45,7 +45,7 @@ struct Cli {
     /// Change an error of the simulated robot, as in `lineslam simulate`.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     settings: Vec<String>,
-    /// Have each instruction take as many cycles as the model of the core says. Takes ten times as long.
+    /// Have each instruction take as many cycles as the model of the core says. Takes several times as long.
     #[arg(long)]
     cycles: bool,
     /// Print the firmware's log as it comes.
@@ -203,7 +203,7 @@ fn print_summary(judged: &Judged, outcome: &Outcome, out: &Path) {
         (
             "instructions",
             format!(
-                "{:.0} million, of {:.2} cycles by the model",
+                "{:.0} million, of {:.2} cycles on average",
                 outcome.instructions as f64 * 1e-6,
                 r.cycles_per_instruction
             ),

@@ -14,7 +14,7 @@ use rigless::session::Session;
 use rigless::time::VirtualNanos;
 
 use crate::board::{
-    CYCLES_PER_100_INSTRUCTIONS, FLASH_ACCELERATED, FLASH_ACR, Nucleo, Shared, TIME_DRIVER_EGR, URG_BRR,
+    CYCLES_PER_INSTRUCTION, FLASH_ACCELERATED, FLASH_ACR, Nucleo, Shared, TIME_DRIVER_EGR, URG_BRR,
 };
 use crate::cycles::{Cause, Program};
 use crate::fault::Fault;
@@ -168,8 +168,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         flash_accelerated: director.flash_accelerated,
         static_bytes: symbols.static_bytes,
         instructions: pace.as_ref().map_or(stop.instruction_count, |p| p.tally.of(Cause::Instructions)),
-        cycles_per_instruction: pace
-            .map_or(CYCLES_PER_100_INSTRUCTIONS as f64 / 100.0, |p| p.tally.cycles_per_instruction()),
+        cycles_per_instruction: pace.map_or(CYCLES_PER_INSTRUCTION, |p| p.tally.cycles_per_instruction()),
         end_us: stop.at.0 / 1000,
         arrived: room.building.arrived(),
     })

@@ -3,7 +3,8 @@
 //! The points are cut into clusters where neighbours lie farther apart than a surface at grazing incidence explains.
 //! A cluster is cut at the point farthest from its chord, in standard deviations of that point's range, until every
 //! piece is straight; neighbouring pieces that are one line after all are joined again; ends that lean off the line
-//! (corners, mixed pixels) are trimmed. A cluster that is round is no wall: its chord turns as the robot passes by. Each line is the total-least-squares fit, weighted by range noise.
+//! (corners, mixed pixels) are trimmed. A cluster that is round is no wall: its chord turns as the robot passes by. Each
+//! line is the total-least-squares fit, weighted by range noise.
 //!
 //! Reference: Nguyen et al., "A comparison of line extraction algorithms using 2D range data" (2007), which found
 //! split-and-merge fastest and among the most correct. The chi-square tests are ours.
