@@ -288,7 +288,7 @@ fn run_experiments(args: &ExperimentsArgs) -> anyhow::Result<()> {
     println!("{}\n\n{}", document::buildings(&results), document::robustness(&results));
     println!("\n{}\n\n{}", document::honesty(&results), document::featureless(&results));
     if !results.recorded.is_empty() {
-        println!("\n{}", document::recorded(&results.recorded));
+        println!("\n{}\n\n{}", document::recorded(&results.recorded), document::walls(&results.recorded));
     }
     println!("\nwritten to {}", args.out.join("experiments.md").display());
     Ok(())

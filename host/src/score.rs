@@ -1,15 +1,28 @@
-//! How a trajectory is judged against a reference: absolute trajectory error after one SE(2) alignment, and relations
-//! between poses that somebody has checked.
+//! How a trajectory is judged against a reference: absolute trajectory error after one SE(2) alignment, relations
+//! between poses that somebody has checked, and how thick it makes the walls.
 
-use nalgebra::{Isometry2, UnitComplex, Vector2};
+use std::collections::HashMap;
 
-/// A stamped planar position, seconds and metres.
+use nalgebra::{Isometry2, Matrix2, Point2, UnitComplex, UnitQuaternion, Vector2};
+
+/// A stamped planar pose, seconds and metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct StampedPosition {
+pub struct StampedPose {
     /// Stamp, seconds.
     pub stamp_s: f64,
-    /// Position, metres.
-    pub position: Vector2<f64>,
+    /// The pose.
+    pub pose: Isometry2<f64>,
+}
+
+impl StampedPose {
+    /// From a stamp in microseconds and a pose of the core's.
+    pub fn of_core(stamp_us: u64, pose: &Isometry2<f32>) -> Self {
+        Self { stamp_s: stamp_us as f64 * 1e-6, pose: nalgebra::convert(*pose) }
+    }
+
+    fn position(&self) -> Vector2<f64> {
+        self.pose.translation.vector
+    }
 }
 
 /// A trajectory file that is not one: the line, from 1.
@@ -20,16 +33,18 @@ pub struct NotTum {
     pub line: usize,
 }
 
-/// Reads the positions of a TUM trajectory.
-pub fn parse_tum(text: &str) -> Result<Vec<StampedPosition>, NotTum> {
+/// Reads a TUM trajectory: of each orientation the turn about the vertical.
+pub fn parse_tum(text: &str) -> Result<Vec<StampedPose>, NotTum> {
     let mut poses = Vec::new();
     for (index, line) in text.lines().enumerate() {
         if line.trim().is_empty() || line.starts_with('#') {
             continue;
         }
         let numbers: Vec<f64> = line.split_whitespace().filter_map(|w| w.parse().ok()).collect();
-        let [stamp_s, x, y, _, _, _, _, _] = numbers[..] else { return Err(NotTum { line: index + 1 }) };
-        poses.push(StampedPosition { stamp_s, position: Vector2::new(x, y) });
+        let [stamp_s, x, y, _, qx, qy, qz, qw] = numbers[..] else { return Err(NotTum { line: index + 1 }) };
+        let (_, _, heading) =
+            UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(qw, qx, qy, qz)).euler_angles();
+        poses.push(StampedPose { stamp_s, pose: Isometry2::new(Vector2::new(x, y), heading) });
     }
     Ok(poses)
 }
@@ -45,18 +60,12 @@ pub struct Alignment {
 
 /// Lays an estimate on a reference with the same stamps (to 2 ms) as well as a rotation and a translation can. Reference
 /// poses without an estimate are scored as standing still since the last one. `None` when nothing agrees.
-pub fn align(estimate: &[StampedPosition], reference: &[StampedPosition]) -> Option<Alignment> {
-    let mut pairs: Vec<(Vector2<f64>, Vector2<f64>)> = Vec::new();
-    let mut rest = estimate.iter().peekable();
-    let mut last = None;
-    for truth in reference {
-        while let Some(e) = rest.next_if(|e| e.stamp_s <= truth.stamp_s + 2e-3) {
-            last = Some(e.position);
-        }
-        if let Some(position) = last {
-            pairs.push((position, truth.position));
-        }
-    }
+pub fn align(estimate: &[StampedPose], reference: &[StampedPose]) -> Option<Alignment> {
+    let truths = reference.iter().map(StampedPose::position);
+    let pairs: Vec<(Vector2<f64>, Vector2<f64>)> = at_stamps(estimate, reference.iter().map(|r| r.stamp_s))
+        .zip(truths)
+        .filter_map(|(found, truth)| Some((found?.translation.vector, truth)))
+        .collect();
     if pairs.is_empty() {
         return None;
     }
@@ -77,8 +86,23 @@ pub fn align(estimate: &[StampedPosition], reference: &[StampedPosition]) -> Opt
     Some(Alignment { reference_from_estimate, rmse_m })
 }
 
+/// The pose of a trajectory at each of some rising stamps (seconds, to 2 ms), or the last one before; none before its first.
+pub fn at_stamps(
+    trajectory: &[StampedPose],
+    stamps_s: impl Iterator<Item = f64>,
+) -> impl Iterator<Item = Option<Isometry2<f64>>> {
+    let mut rest = trajectory.iter().peekable();
+    let mut last = None;
+    stamps_s.map(move |stamp_s| {
+        while let Some(next) = rest.next_if(|next| next.stamp_s <= stamp_s + 2e-3) {
+            last = Some(next.pose);
+        }
+        last
+    })
+}
+
 /// Root mean square distance, metres, after [`align`].
-pub fn absolute_trajectory_error(estimate: &[StampedPosition], reference: &[StampedPosition]) -> Option<f64> {
+pub fn absolute_trajectory_error(estimate: &[StampedPose], reference: &[StampedPose]) -> Option<f64> {
     align(estimate, reference).map(|a| a.rmse_m)
 }
 
@@ -111,15 +135,15 @@ pub fn parse_relations(text: &str) -> Result<Vec<Relation>, NotRelation> {
     Ok(relations)
 }
 
-/// Mean distance, metres, between relations and what a trajectory of stamps (s) and poses says, linear between its
-/// stamps. Relations outside it are left out. `None` when all are.
-pub fn mean_relation_error_m(trajectory: &[(f64, Isometry2<f64>)], relations: &[Relation]) -> Option<f64> {
+/// Mean distance, metres, between relations and what a trajectory says, linear between its stamps. Relations outside it
+/// are left out. `None` when all are.
+pub fn mean_relation_error_m(trajectory: &[StampedPose], relations: &[Relation]) -> Option<f64> {
     let at = |stamp_s: f64| {
-        let after = trajectory.partition_point(|(s, _)| *s < stamp_s);
+        let after = trajectory.partition_point(|pose| pose.stamp_s < stamp_s);
         let (first, last) = (trajectory.get(after.saturating_sub(1))?, trajectory.get(after)?);
-        let span_s = last.0 - first.0;
-        let share = if span_s > 0.0 { (stamp_s - first.0) / span_s } else { 1.0 };
-        (0.0..=1.0).contains(&share).then(|| first.1.lerp_slerp(&last.1, share))
+        let span_s = last.stamp_s - first.stamp_s;
+        let share = if span_s > 0.0 { (stamp_s - first.stamp_s) / span_s } else { 1.0 };
+        (0.0..=1.0).contains(&share).then(|| first.pose.lerp_slerp(&last.pose, share))
     };
     let errors: Vec<f64> = relations
         .iter()
@@ -132,41 +156,114 @@ pub fn mean_relation_error_m(trajectory: &[(f64, Isometry2<f64>)], relations: &[
     (!errors.is_empty()).then(|| errors.iter().sum::<f64>() / errors.len() as f64)
 }
 
+/// Points around one within this distance are its wall, metres; found by cells of [`CELL_M`].
+const WALL_RADIUS_M: f64 = 0.3;
+const CELL_M: f64 = 0.05;
+/// A point with fewer around it says nothing.
+const LEAST_POINTS: f64 = 10.0;
+
+/// Number, sum and sum of squares of some points.
+#[derive(Clone, Copy, Default)]
+struct Sums {
+    n: f64,
+    sum: Vector2<f64>,
+    squares: Matrix2<f64>,
+}
+
+impl Sums {
+    fn add(&mut self, other: &Self) {
+        self.n += other.n;
+        self.sum += other.sum;
+        self.squares += other.squares;
+    }
+
+    /// Standard deviation across the direction in which they are spread most.
+    fn thickness_m(&self) -> f64 {
+        let mean = self.sum / self.n;
+        let [a, b] = (self.squares / self.n - mean * mean.transpose()).symmetric_eigenvalues().into();
+        f64::min(a, b).max(0.0).sqrt()
+    }
+}
+
+/// How thick each point's wall is: the standard deviation of the points around it, across, metres. Points that stand
+/// alone are left out.
+///
+/// Work: for each occupied cell some hundred steps.
+pub fn wall_thicknesses_m(points: &[Point2<f64>]) -> Vec<f64> {
+    let Some(first) = points.first() else { return Vec::new() };
+    let mut cells: HashMap<(i64, i64), Sums> = HashMap::new();
+    for point in points {
+        // Squares keep their digits where all points are far from the origin.
+        let at = point - first;
+        let key = ((at.x / CELL_M).floor() as i64, (at.y / CELL_M).floor() as i64);
+        cells.entry(key).or_default().add(&Sums { n: 1.0, sum: at, squares: at * at.transpose() });
+    }
+    let reach = (WALL_RADIUS_M / CELL_M).round() as i64;
+    let disc: Vec<(i64, i64)> = (-reach..=reach)
+        .flat_map(|x| (-reach..=reach).map(move |y| (x, y)))
+        .filter(|(x, y)| x * x + y * y <= reach * reach)
+        .collect();
+    let mut thicknesses = Vec::with_capacity(points.len());
+    for ((x, y), own) in &cells {
+        let mut around = Sums::default();
+        disc.iter().filter_map(|(dx, dy)| cells.get(&(x + dx, y + dy))).for_each(|cell| around.add(cell));
+        if around.n >= LEAST_POINTS {
+            thicknesses.extend(std::iter::repeat_n(around.thickness_m(), own.n as usize));
+        }
+    }
+    thicknesses
+}
+
+/// Mean, median and largest of some numbers.
+#[derive(Clone, Copy, Debug)]
+pub struct Spread {
+    /// Their mean.
+    pub mean: f64,
+    /// The middle one, of an even number the mean of both.
+    pub median: f64,
+    /// The largest.
+    pub worst: f64,
+}
+
+impl Spread {
+    /// `None` of none.
+    pub fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
+        let mut sorted: Vec<f64> = values.collect();
+        sorted.sort_unstable_by(f64::total_cmp);
+        let n = sorted.len();
+        let median = 0.5 * (sorted.get(n.checked_sub(1)? / 2)? + sorted.get(n / 2)?);
+        Some(Self { mean: sorted.iter().sum::<f64>() / n as f64, median, worst: *sorted.last()? })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn trajectory() -> Vec<(f64, Isometry2<f64>)> {
-        (0..50).map(|k| f64::from(k) * 0.1).map(|t| (t, Isometry2::new(Vector2::new(t, t * t), t))).collect()
-    }
-
-    fn positions(carry: Isometry2<f64>) -> Vec<StampedPosition> {
-        let at = |(stamp_s, p): (f64, Isometry2<f64>)| StampedPosition {
-            stamp_s,
-            position: (carry * p).translation.vector,
-        };
-        trajectory().into_iter().map(at).collect()
+    fn trajectory(carry: Isometry2<f64>) -> Vec<StampedPose> {
+        let at = |t: f64| StampedPose { stamp_s: t, pose: carry * Isometry2::new(Vector2::new(t, t * t), t) };
+        (0..50).map(|k| f64::from(k) * 0.1).map(at).collect()
     }
 
     #[test]
     fn alignment_takes_out_where_a_map_begins_and_nothing_else() {
         let carry = Isometry2::new(Vector2::new(3.0, -4.0), 2.0);
-        let found = align(&positions(Isometry2::identity()), &positions(carry)).unwrap();
+        let found = align(&trajectory(Isometry2::identity()), &trajectory(carry)).unwrap();
         assert!(found.rmse_m < 1e-12);
         assert!((found.reference_from_estimate.inverse() * carry).translation.vector.norm() < 1e-12);
-        let mut off = positions(carry);
+        let mut off = trajectory(carry);
         for (k, p) in off.iter_mut().enumerate() {
-            p.position.x += if k % 2 == 0 { 0.1 } else { -0.1 };
+            p.pose.translation.x += if k % 2 == 0 { 0.1 } else { -0.1 };
         }
-        let error = absolute_trajectory_error(&positions(Isometry2::identity()), &off).unwrap();
+        let error = absolute_trajectory_error(&trajectory(Isometry2::identity()), &off).unwrap();
         assert!((error - 0.1).abs() < 1e-3, "{error}");
         assert!(absolute_trajectory_error(&[], &off).is_none());
     }
 
     #[test]
     fn relations_are_read_and_measured() {
-        let trajectory = trajectory();
-        let said = trajectory[10].1.inv_mul(&trajectory[30].1);
+        let trajectory = trajectory(Isometry2::identity());
+        let said = trajectory[10].pose.inv_mul(&trajectory[30].pose);
         let line = |dx: f64| {
             format!("1.0 3.0 {} {} {}\n", said.translation.x + dx, said.translation.y, said.rotation.angle())
         };
@@ -176,5 +273,43 @@ mod tests {
         assert_eq!(parse_relations("1 2 3 4 5\n1 2 3\n").unwrap_err().line, 2);
         let outside = parse_relations("80 90 0 0 0").unwrap();
         assert!(mean_relation_error_m(&trajectory, &outside).is_none());
+    }
+
+    #[test]
+    fn a_trajectory_file_is_read_with_its_headings() {
+        let text = "# stamp x y z qx qy qz qw\n\n1.5 2 -3 0 0 0 0.6 0.8\n";
+        let want = StampedPose {
+            stamp_s: 1.5,
+            pose: Isometry2::new(Vector2::new(2.0, -3.0), 2.0 * 0.6_f64.atan2(0.8)),
+        };
+        let [read] = parse_tum(text).unwrap()[..] else { panic!("one pose") };
+        assert_eq!(read.stamp_s, want.stamp_s);
+        assert!(read.pose.inv_mul(&want.pose).to_homogeneous().is_identity(1e-12), "{read:?}");
+        assert_eq!(parse_tum("1 2 3 4 5 6 7 8\n1 2 3\n").unwrap_err().line, 2);
+    }
+
+    /// A wall seen twice, the second time shifted: its points lie half the shift to either side.
+    #[test]
+    fn a_wall_is_as_thick_as_what_was_seen_of_it_lies_apart() {
+        let turn = UnitComplex::new(0.4);
+        let wall = |shift: f64| (0..500).map(move |k| turn * Point2::new(f64::from(k) * 0.01 + 1e3, shift));
+        for shift in [0.0, 0.02, 0.1] {
+            let mut points: Vec<_> = wall(0.0).chain(wall(shift)).collect();
+            let expected = shift / 2.0;
+            let all = wall_thicknesses_m(&points);
+            assert_eq!(all.len(), 1000);
+            let got = Spread::of(all.into_iter()).unwrap().median;
+            assert!((got - expected).abs() < 1e-3, "{got}, shifted by {shift}");
+            points.push(Point2::new(0.0, 0.0));
+            assert_eq!(wall_thicknesses_m(&points).len(), 1000, "one alone is no wall");
+        }
+        assert!(wall_thicknesses_m(&[]).is_empty());
+    }
+
+    #[test]
+    fn a_spread_is_mean_median_and_worst() {
+        let spread = Spread::of([4.0, 1.0, 2.0, 9.0].into_iter()).unwrap();
+        assert_eq!((spread.mean, spread.median, spread.worst), (4.0, 3.0, 9.0));
+        assert!(Spread::of(std::iter::empty()).is_none());
     }
 }

@@ -167,7 +167,7 @@ impl SlamConfig {
             extraction: ExtractionConfig::Ransac(RansacConfig {
                 draws: 50,               // ours
                 inlier_distance_m: 0.03, // ours: the sensor's ±30 mm
-                max_gap_m: 0.1,          // ours
+                max_gap_m: 0.2,          // ours
                 min_inliers: 6,          // ours
                 seed: 1,
             }),

@@ -400,12 +400,15 @@ fn with_line_noise([offset, direction]: [f32; 2], noise: &LineNoise, length_m: f
     [offset + noise.var_offset(), direction + noise.var_direction(length_m)]
 }
 
-/// Fig. 6: the least-squares line through the four end points, n = n_m + n_g.
+/// Fig. 6: the least-squares line through the four end points, each as heavy as the points it stands for, as in equation
+/// (3); n = n_m + n_g.
 fn joined_by_end_points(mapped: &Segment, seen: &Segment) -> Segment {
     let ends = [mapped.start, mapped.end, seen.start, seen.end];
     let inliers = mapped.moments.inliers.saturating_add(seen.moments.inliers);
     let weight = mapped.moments.weight + seen.moments.weight;
-    let mut moments = Moments::from_points(ends.iter().map(|&p| (p, 0.25 * weight)));
+    let [before, now] =
+        [mapped, seen].map(|segment| 0.5 * weight * segment.moments.inliers as f32 / inliers as f32);
+    let mut moments = Moments::from_points(ends.into_iter().zip([before, before, now, now]));
     moments.inliers = inliers;
     // The map segment's free side is kept: a point just off its middle on that side.
     Segment::fitted(moments, &ends, mapped.midpoint() + mapped.normal())
@@ -598,6 +601,11 @@ mod tests {
         assert!((f64::from(joined.direction.y.atan2(joined.direction.x)) - angle).abs() < 1e-5);
         assert!((f64::from(joined.moments.centroid.y) - mean_y).abs() < 1e-6);
         assert_eq!(joined.moments.inliers, 80);
+        // What was seen often is hardly moved by one more look.
+        let mut often = mapped;
+        often.moments.inliers = 19 * seen.moments.inliers;
+        let joined = joined_by_end_points(&often, &seen);
+        assert!((joined.moments.centroid.y - (0.95 + 0.05 * 1.15)).abs() < 1e-6, "{joined:?}");
     }
 
     #[test]

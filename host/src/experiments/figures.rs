@@ -1,6 +1,6 @@
 //! The figures: map over blueprint or reference, and what dead reckoning would have drawn.
 
-use nalgebra::{Isometry2, Vector2};
+use nalgebra::Isometry2;
 use slam_core::SlamConfig;
 
 use super::Figure;
@@ -8,7 +8,7 @@ use crate::log::Log;
 use crate::output::svg::{self, Scene};
 use crate::replay::{self, Replay, ReplayError, Step};
 use crate::robot::Robot;
-use crate::score::{self, StampedPosition};
+use crate::score::{self, StampedPose};
 use crate::sim::world::World;
 use crate::sim::{self, SimConfig, judge};
 
@@ -37,14 +37,18 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
 }
 
 /// The map of a recorded log, with the reference trajectory laid on it.
-pub fn recorded(name: &str, log: &Log, replay: &Replay, reference: &[StampedPosition]) -> Figure {
-    let positions = super::stamped(replay::trajectory(&replay.steps));
-    let reference: Vec<Isometry2<f32>> = score::align(reference, &positions)
+pub fn recorded(
+    name: &str,
+    log: &Log,
+    replay: &Replay,
+    poses: &[StampedPose],
+    reference: &[StampedPose],
+) -> Figure {
+    let reference: Vec<Isometry2<f32>> = score::align(reference, poses)
         .map(|alignment| {
             let carried =
-                |p: &StampedPosition| alignment.reference_from_estimate * nalgebra::Point2::from(p.position);
-            let pose = |p: nalgebra::Point2<f64>| Isometry2::new(Vector2::new(p.x as f32, p.y as f32), 0.0);
-            reference.iter().map(carried).map(pose).collect()
+                |p: &StampedPose| nalgebra::convert_unchecked(alignment.reference_from_estimate * p.pose);
+            reference.iter().map(carried).collect()
         })
         .unwrap_or_default();
     let title = format!("{name} ({})", log.format);

@@ -6,14 +6,14 @@ pub mod figures;
 
 use std::path::{Path, PathBuf};
 
-use nalgebra::Isometry2;
+use nalgebra::{Isometry2, Point2};
 use rayon::prelude::*;
 use slam_core::SlamConfig;
 
 use crate::log::{self, Format, LogError, ReadOptions};
-use crate::replay::{self, Replay, ReplayError};
+use crate::replay::{self, Replay, ReplayError, Step};
 use crate::robot::Robot;
-use crate::score::{self, Relation, StampedPosition};
+use crate::score::{self, Relation, Spread, StampedPose};
 use crate::sim::judge::{self, Judgement, TrajectoryErrors};
 use crate::sim::world::World;
 use crate::sim::{self, Drive, SimConfig, WheelModel};
@@ -122,7 +122,23 @@ pub struct Recorded {
     pub loops_closed: u32,
     /// Mean error of relations checked by hand, where there are any, metres.
     pub relations_m: Option<f64>,
+    /// Walls of the scans laid by the default configuration's poses.
+    pub walls: Walls,
+    /// The same scans laid by the reference's poses.
+    pub reference_walls: Walls,
 }
+
+/// How thick walls are, by [`score::wall_thicknesses_m`]: medians over all points, metres.
+#[derive(Clone, Copy, Debug)]
+pub struct Walls {
+    /// Of all scans together.
+    pub whole_m: f64,
+    /// Of each pass of [`PASS_M`] alone.
+    pub pass_m: f64,
+}
+
+/// Way that counts as one pass, too short to have come back, metres.
+pub const PASS_M: f32 = 10.0;
 
 /// File name and content of a figure.
 pub type Figure = (String, String);
@@ -267,29 +283,28 @@ fn recorded(
     let reference_path = data.join(format!("{name}.ref.tum"));
     let reference = read_with(&reference_path, score::parse_tum)?;
     let replay = |config: SlamConfig| replay::run(&log, &robot, config, || {});
-    let error_m = |positions: &[StampedPosition]| {
-        score::absolute_trajectory_error(positions, &reference).unwrap_or(f64::NAN)
-    };
+    let error_m =
+        |poses: &[StampedPose]| score::absolute_trajectory_error(poses, &reference).unwrap_or(f64::NAN);
     let default = replay(SlamConfig::default())?;
     let open_loop = replay(SlamConfig { loop_closure: None, ..SlamConfig::default() })?;
     let paper = replay(SlamConfig::paper())?;
     let relations_path = data.join(format!("{name}.relations"));
     let relations: Option<Vec<Relation>> =
         relations_path.exists().then(|| read_with(&relations_path, score::parse_relations)).transpose()?;
-    let poses: Vec<(f64, Isometry2<f64>)> = replay::trajectory(&default.steps)
-        .map(|(stamp_us, pose)| (stamp_us as f64 * 1e-6, nalgebra::convert(*pose)))
-        .collect();
+    let poses = stamped(replay::trajectory(&default.steps));
     let measured = Recorded {
         name,
         scans: default.steps.len(),
         dead_reckoning_m: error_m(&stamped(replay::dead_reckoning(&default.steps))),
         paper_m: error_m(&stamped(replay::trajectory(&paper.steps))),
-        default_m: error_m(&stamped(replay::trajectory(&default.steps))),
+        default_m: error_m(&poses),
         open_loop_m: error_m(&stamped(replay::trajectory(&open_loop.steps))),
         loops_closed: default.counters.loops_closed,
         relations_m: relations.and_then(|r| score::mean_relation_error_m(&poses, &r)),
+        walls: walls(&default.steps, &poses),
+        reference_walls: walls(&default.steps, &reference),
     };
-    let figure = figures::recorded(name, &log, &default, &reference);
+    let figure = figures::recorded(name, &log, &default, &poses, &reference);
     Ok(Some((measured, figure)))
 }
 
@@ -302,12 +317,28 @@ fn read_with<T, E: std::fmt::Display>(
     parse(&text).map_err(|e| failed(e.to_string()))
 }
 
-/// Positions and stamps of a trajectory, for scoring.
-fn stamped<'a>(poses: impl Iterator<Item = (u64, &'a Isometry2<f32>)>) -> Vec<StampedPosition> {
-    poses
-        .map(|(stamp_us, pose)| StampedPosition {
-            stamp_s: stamp_us as f64 * 1e-6,
-            position: nalgebra::convert(pose.translation.vector),
+/// The walls of a replay's scans, laid by these poses.
+pub fn walls(steps: &[Step], poses: &[StampedPose]) -> Walls {
+    let at = score::at_stamps(poses, steps.iter().map(|step| step.stamp_us as f64 * 1e-6));
+    let laid: Vec<(u32, Vec<Point2<f64>>)> = steps
+        .iter()
+        .zip(at)
+        .filter_map(|(step, pose)| {
+            let pose = pose?;
+            let laid = step.points.iter().map(|point| pose * nalgebra::convert::<_, Point2<f64>>(*point));
+            Some(((step.update.way_m / PASS_M) as u32, laid.collect()))
         })
-        .collect()
+        .collect();
+    let thicknesses = |scans: &[(u32, Vec<Point2<f64>>)]| {
+        let points: Vec<Point2<f64>> = scans.iter().flat_map(|(_, points)| points).copied().collect();
+        score::wall_thicknesses_m(&points)
+    };
+    let median = |thicknesses: Vec<f64>| Spread::of(thicknesses.into_iter()).map_or(f64::NAN, |s| s.median);
+    let passes = laid.chunk_by(|(a, _), (b, _)| a == b);
+    Walls { whole_m: median(thicknesses(&laid)), pass_m: median(passes.flat_map(thicknesses).collect()) }
+}
+
+/// A trajectory as it is scored.
+pub fn stamped<'a>(poses: impl Iterator<Item = (u64, &'a Isometry2<f32>)>) -> Vec<StampedPose> {
+    poses.map(|(stamp_us, pose)| StampedPose::of_core(stamp_us, pose)).collect()
 }

@@ -6,7 +6,7 @@ use slam_core::{MapSegment, Segment};
 use super::Drive;
 use super::world::{Disc, Edge, World};
 use crate::replay::{ESTABLISHED_HITS, Replay, Step};
-use crate::score::{StampedPosition, absolute_trajectory_error};
+use crate::score::{StampedPose, absolute_trajectory_error};
 
 /// A map line stands for a blueprint wall when it passes this close to the corner, metres, …
 const WALL_DISTANCE_M: f64 = 0.35;
@@ -73,12 +73,8 @@ pub struct TrajectoryErrors {
 
 /// Errors of poses that begin at the truth's start.
 pub fn trajectory_errors(truth: &[Isometry2<f64>], poses: &[Isometry2<f64>]) -> TrajectoryErrors {
-    let stamped = |poses: &[Isometry2<f64>]| -> Vec<StampedPosition> {
-        let at = |(k, p): (usize, &Isometry2<f64>)| StampedPosition {
-            stamp_s: k as f64,
-            position: p.translation.vector,
-        };
-        poses.iter().enumerate().map(at).collect()
+    let stamped = |poses: &[Isometry2<f64>]| -> Vec<StampedPose> {
+        poses.iter().enumerate().map(|(k, pose)| StampedPose { stamp_s: k as f64, pose: *pose }).collect()
     };
     let last = truth.last().zip(poses.last()).map(|(truth, pose)| truth.inv_mul(pose));
     TrajectoryErrors {
