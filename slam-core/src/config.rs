@@ -119,9 +119,10 @@ impl Default for SlamConfig {
                 max_iterations: 8,
                 converged_step: 1e-3,
                 kernel_chi2: 4.0,
+                close_heading_rad: 0.02,
                 direction_trust_rad: 0.02,
                 observable_sigma_m: 0.1,
-                search: SearchConfig { below_support: 0.8, gain: 0.1, step_rad: 0.1, reach_rad: 0.6 },
+                search: SearchConfig { below_support: 0.8, gain: 0.15, step_rad: 0.1, reach_rad: 0.6 },
             }),
             loop_closure: Some(LoopConfig {
                 min_way_m: 20.0,
@@ -261,6 +262,7 @@ impl SlamConfig {
             check("correction.maximum_a_posteriori.max_iterations", c.max_iterations > 0)?;
             not_negative("correction.maximum_a_posteriori.converged_step", c.converged_step)?;
             positive("correction.maximum_a_posteriori.kernel_chi2", c.kernel_chi2)?;
+            not_negative("correction.maximum_a_posteriori.close_heading_rad", c.close_heading_rad)?;
             not_negative("correction.maximum_a_posteriori.direction_trust_rad", c.direction_trust_rad)?;
             positive("correction.maximum_a_posteriori.observable_sigma_m", c.observable_sigma_m)?;
             not_negative("correction.maximum_a_posteriori.search.below_support", c.search.below_support)?;

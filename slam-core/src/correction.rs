@@ -39,6 +39,9 @@ pub struct MapConfig {
     pub converged_step: f32,
     /// Scale of the Cauchy kernel: a pair of this χ² keeps half its weight.
     pub kernel_chi2: f32,
+    /// A prediction surer of its heading than this, standard deviation in radians, is close: few pairs are wrong, so that
+    /// the kernel forgives them what the prediction may be off by. Farther off, pairs that agree with it lead.
+    pub close_heading_rad: f32,
     /// Directions of lines are not trusted beyond this, radians: translation information across nearly parallel
     /// lines that so small an error would explain is not used.
     pub direction_trust_rad: f32,
@@ -48,7 +51,7 @@ pub struct MapConfig {
     pub search: SearchConfig,
 }
 
-/// Settings of the search for another heading where little of a scan was recognised.
+/// Settings of the search for another pose where little of a scan was recognised.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -139,6 +142,15 @@ pub struct Prior {
     pub covariance: Matrix3<f32>,
 }
 
+/// Where a step towards the posterior is made from.
+#[derive(Clone, Copy, Debug)]
+pub struct Standpoint<'a> {
+    /// Pose of `base` in `map`.
+    pub pose: &'a Isometry2<f32>,
+    /// Covariance (x, y, θ) of that pose, in `map`: the kernel forgives pairs the misfit that it explains. Without, none.
+    pub forgiven: Option<&'a Matrix3<f32>>,
+}
+
 /// Equations (3)–(9): one linear least-squares step on the end points of the observed segments.
 ///
 /// `None` when the system is singular. The paper gives no covariance; here it is that of points of variance
@@ -180,7 +192,7 @@ pub fn least_squares(
     finite(Correction { pose: corrected, covariance, step: largest(&step), observability })
 }
 
-/// One Gauss-Newton step towards the pose of largest posterior probability, from `at`.
+/// One Gauss-Newton step towards the pose of largest posterior probability.
 ///
 /// `None` when the numbers do not allow a step (a prior that is not positive definite, infinities). Work: one step
 /// for each pair.
@@ -189,22 +201,22 @@ pub fn maximum_a_posteriori(
     pairs: &[Pair],
     map: &[MapSegment],
     prior: &Prior,
-    at: &Isometry2<f32>,
+    from: &Standpoint<'_>,
     line_noise: &LineNoise,
     config: &MapConfig,
 ) -> Option<Correction> {
-    let (information, gradient) = pair_sums(observed, pairs, map, at, line_noise, config);
+    let (information, gradient) = pair_sums(observed, pairs, map, from, line_noise, config);
     let observability = judge(&information, config.direction_trust_rad, config.observable_sigma_m);
     let mut trust = Matrix3::identity();
     trust.fixed_view_mut::<2, 2>(0, 0).copy_from(&observability.trusted());
     let prior_information = prior.covariance.cholesky()?.inverse();
-    let (from, to) = (components(at), components(&prior.pose));
-    let mut drawn = to - from;
+    let (at, to) = (components(from.pose), components(&prior.pose));
+    let mut drawn = to - at;
     drawn.z = crate::math::wrap_angle(drawn.z);
     let total = trust * information * trust + prior_information;
     let covariance = total.cholesky()?.inverse();
     let step = covariance * (trust * gradient + prior_information * drawn);
-    let corrected = pose(from.x + step.x, from.y + step.y, from.z + step.z);
+    let corrected = pose(at.x + step.x, at.y + step.y, at.z + step.z);
     finite(Correction { pose: corrected, covariance, step: largest(&step), observability })
 }
 
@@ -213,20 +225,21 @@ fn pair_sums(
     observed: &[Segment],
     pairs: &[Pair],
     map: &[MapSegment],
-    at: &Isometry2<f32>,
+    from: &Standpoint<'_>,
     line_noise: &LineNoise,
     config: &MapConfig,
 ) -> (Matrix3<f32>, Vector3<f32>) {
     let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
+    let position = from.pose.translation.vector.into();
     for pair in pairs {
         let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get(pair.mapped)) else { continue };
-        let seen = seen.transformed(at);
-        let Some(residual) = Residual::new(&seen, &entry.segment, at.translation.vector.into(), line_noise)
-        else {
-            continue;
-        };
+        let seen = seen.transformed(from.pose);
+        let Some(residual) = Residual::new(&seen, &entry.segment, position, line_noise) else { continue };
         let Some(weight) = residual.information() else { continue };
-        let chi2 = residual.error.dot(&(weight * residual.error));
+        let chi2 = match from.forgiven {
+            Some(covariance) => residual.chi2(covariance),
+            None => residual.error.dot(&(weight * residual.error)),
+        };
         let kept = weight / (1.0 + chi2 / config.kernel_chi2);
         let weighed = residual.jacobian.transpose() * kept;
         information += weighed * residual.jacobian;
@@ -338,6 +351,18 @@ mod tests {
             .collect()
     }
 
+    /// A step that forgives nothing.
+    fn strict_step(
+        observed: &[Segment],
+        pairs: &[Pair],
+        map: &[MapSegment],
+        prior: &Prior,
+        at: &Isometry2<f32>,
+    ) -> Option<Correction> {
+        let from = Standpoint { pose: at, forgiven: None };
+        maximum_a_posteriori(observed, pairs, map, prior, &from, &NOISE, &config())
+    }
+
     fn all_pairs(n: usize) -> Vec<Pair> {
         (0..n).map(|i| Pair { observed: i, mapped: i }).collect()
     }
@@ -408,7 +433,7 @@ mod tests {
             };
             let mut at = prior.pose;
             for _ in 0..15 {
-                at = maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &at, &NOISE, &config()).unwrap().pose;
+                at = strict_step(&observed, &all_pairs(4), &map, &prior, &at).unwrap().pose;
             }
             let off = truth.inverse() * at;
             prop_assert!(off.translation.vector.norm() < 2e-3, "{}", off);
@@ -419,7 +444,7 @@ mod tests {
     #[test]
     fn no_pair_leaves_the_prior_as_it_is() {
         let prior = Prior { pose: pose(1.0, 2.0, 3.0), covariance: Matrix3::identity() * 0.01 };
-        let got = maximum_a_posteriori(&[], &[], &[], &prior, &prior.pose, &NOISE, &config()).unwrap();
+        let got = strict_step(&[], &[], &[], &prior, &prior.pose).unwrap();
         assert_eq!(got.observability.verdict, Verdict::Blind);
         assert!((got.covariance - prior.covariance).norm() < 1e-6);
         assert!((components(&got.pose) - components(&prior.pose)).norm() < 1e-6);
@@ -449,8 +474,7 @@ mod tests {
         let mut at = prior.pose;
         let mut last = None;
         for _ in 0..8 {
-            let step =
-                maximum_a_posteriori(&observed, &all_pairs(2), &map, &prior, &at, &NOISE, &config()).unwrap();
+            let step = strict_step(&observed, &all_pairs(2), &map, &prior, &at).unwrap();
             (at, last) = (step.pose, Some(step));
         }
         let (c, last) = (components(&at), last.unwrap());
@@ -472,11 +496,38 @@ mod tests {
         let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() * 0.01 };
         let mut at = prior.pose;
         for _ in 0..8 {
-            at = maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &at, &NOISE, &config())
-                .unwrap()
-                .pose;
+            at = strict_step(&observed, &all_pairs(4), &map, &prior, &at).unwrap().pose;
         }
         assert!(at.translation.vector.norm() < 0.03, "{at}");
+    }
+
+    /// The prediction is off, and a short far wall mistaken for another agrees with it: the many that do not are right.
+    #[test]
+    fn what_the_prediction_may_be_off_by_is_not_held_against_the_pairs() {
+        let truth = pose(0.0, 0.0, 0.06);
+        let mut walls = room();
+        walls.push(wall((-2.0, -6.0), (-1.4, -6.0), 8));
+        let observed: Vec<Segment> = walls.iter().map(|s| s.transformed(&truth.inverse())).collect();
+        walls[4] = observed[4];
+        let map = entries(&walls);
+        let prior = Prior {
+            pose: pose(0.0, 0.0, 0.0),
+            covariance: Matrix3::from_diagonal(&Vector3::new(1e-5, 1e-5, 9e-4)),
+        };
+        let heading_after = |forgives: bool| {
+            let (mut at, mut covariance) = (prior.pose, prior.covariance);
+            for _ in 0..8 {
+                let from = Standpoint { pose: &at, forgiven: forgives.then_some(&covariance) };
+                let step =
+                    maximum_a_posteriori(&observed, &all_pairs(5), &map, &prior, &from, &NOISE, &config())
+                        .unwrap();
+                (at, covariance) = (step.pose, step.covariance);
+            }
+            crate::pose::heading(&at)
+        };
+        let (strict, forgiving) = (heading_after(false), heading_after(true));
+        assert!((forgiving - 0.06).abs() < 0.005, "{forgiving}");
+        assert!((strict - 0.06).abs() > 2.0 * (forgiving - 0.06).abs(), "{strict}");
     }
 
     /// The reported covariance is that of the estimates' scatter over random noise.
@@ -510,8 +561,10 @@ mod tests {
                 .collect();
             let mut at = prior.pose;
             for _ in 0..4 {
-                let step = maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &at, &noise, &config)
-                    .unwrap();
+                let from = Standpoint { pose: &at, forgiven: None };
+                let step =
+                    maximum_a_posteriori(&observed, &all_pairs(4), &map, &prior, &from, &noise, &config)
+                        .unwrap();
                 (at, reported) = (step.pose, step.covariance);
             }
             let c = components(&at);

@@ -8,7 +8,7 @@ use nalgebra::{Isometry2, Matrix3, Vector3};
 use crate::association::{AssociationConfig, Pair, Shortlist, View, associate};
 use crate::config::{ConfigError, SlamConfig};
 use crate::correction::{
-    Correction, CorrectionConfig, Observability, Prior, SearchConfig, Verdict, least_squares,
+    Correction, CorrectionConfig, MapConfig, Observability, Prior, Standpoint, Verdict, least_squares,
     maximum_a_posteriori,
 };
 use crate::deskew::{DeskewReport, ScanPoint, deskew};
@@ -472,11 +472,18 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     ) {
         watch(Stage::Association);
         self.find_nearby(&prior.pose, |_| true);
+        let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction else {
+            self.refine(prior, update, Kernel::Strict, watch);
+            return;
+        };
         let predicted = *update;
-        self.refine(prior, update, watch);
-        if let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction {
-            self.search_heading(prior, motion, &config.search, &predicted, update, watch);
+        self.refine(prior, update, Kernel::first(prior, &config), watch);
+        if update.support >= config.search.below_support || self.nearby.all().is_empty() {
+            return;
         }
+        self.search(prior, motion, &config, &predicted, update, watch);
+        watch(Stage::Association);
+        self.associate(update);
     }
 
     /// The map segments that a scan from this pose can touch and that count; the paper looks at all of them.
@@ -508,7 +515,13 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// Rounds of association and correction from the pose of `update`.
-    fn refine(&mut self, prior: &Prior, update: &mut SlamUpdate, watch: &mut impl FnMut(Stage)) {
+    fn refine(
+        &mut self,
+        prior: &Prior,
+        update: &mut SlamUpdate,
+        kernel: Kernel,
+        watch: &mut impl FnMut(Stage),
+    ) {
         let rounds = match &self.config.correction {
             CorrectionConfig::LeastSquares => 1,
             CorrectionConfig::MaximumAPosteriori(config) => config.max_iterations,
@@ -518,7 +531,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             self.associate(update);
             watch(Stage::Correction);
             update.iterations = update.iterations.saturating_add(1);
-            let Some(correction) = self.step(prior, &update.pose) else { break };
+            let Some(correction) = self.step(prior, update, kernel) else { break };
             update.corrected |= !self.pairs.is_empty();
             update.pose = correction.pose;
             update.covariance = correction.covariance;
@@ -530,18 +543,25 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         update.support = self.support();
     }
 
-    /// Where little of the scan was recognised, the odometry may have been wrong by more than it knows: other headings
-    /// are tried, with a prior that allows them. The one from which most is recognised wins, if it is much more.
-    fn search_heading(
+    /// Where little of the scan was recognised: the pairs are weighed by the other kernel, and then, as the odometry may have been
+    /// wrong by more than it knows, other headings are tried, with a prior that allows them. The pose from which most is
+    /// recognised wins, if it is much more.
+    fn search(
         &mut self,
         prior: &Prior,
         motion: &ScanMotion,
-        config: &SearchConfig,
+        config: &MapConfig,
         predicted: &SlamUpdate,
         best: &mut SlamUpdate,
         watch: &mut impl FnMut(Stage),
     ) {
-        if best.support >= config.below_support || self.nearby.all().is_empty() {
+        let mut hypothesis = *predicted;
+        self.refine(prior, &mut hypothesis, Kernel::first(prior, config).other(), watch);
+        let config = &config.search;
+        if hypothesis.support > best.support + config.gain {
+            *best = hypothesis;
+        }
+        if best.support >= config.below_support {
             return;
         }
         let increment = &motion.since_previous;
@@ -558,7 +578,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
                 let offset = side * f32::from(turn) * config.step_rad;
                 hypothesis.pose = pose(centre.x, centre.y, centre.z + offset);
                 hypothesis.covariance = broad.covariance;
-                self.refine(&broad, &mut hypothesis, watch);
+                self.refine(&broad, &mut hypothesis, Kernel::Strict, watch);
                 let least = winner.as_ref().map_or(best.support + config.gain, |w| w.support);
                 if hypothesis.support > least {
                     winner = Some(hypothesis);
@@ -571,8 +591,6 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             self.loosen_joint(&(broad.covariance - prior.covariance));
             self.find_nearby(&best.pose, |_| true);
         }
-        watch(Stage::Association);
-        self.associate(best);
     }
 
     /// Recognises old parts of the map from which the pose has drifted, and closes the loop.
@@ -589,7 +607,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let prior = Prior { pose: update.pose, covariance: update.covariance + drift(config, oldest) };
         let mut hypothesis = *update;
         hypothesis.covariance = prior.covariance;
-        self.refine(&prior, &mut hypothesis, watch);
+        self.refine(&prior, &mut hypothesis, Kernel::Strict, watch);
         self.find_nearby(&update.pose, |_| true);
         let seen =
             hypothesis.observability.verdict == Verdict::Full && hypothesis.support >= config.min_support;
@@ -635,14 +653,16 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         associate(&self.observed, &view, map, nearby, &config.association, shortlist, &mut self.pairs);
     }
 
-    fn step(&self, prior: &Prior, at: &Isometry2<f32>) -> Option<Correction> {
+    fn step(&self, prior: &Prior, update: &SlamUpdate, kernel: Kernel) -> Option<Correction> {
         let (observed, pairs, map) = (&self.observed, &self.pairs, self.map.segments());
         match &self.config.correction {
             CorrectionConfig::LeastSquares => {
-                least_squares(observed, pairs, map, at, self.config.sensor.noise.variance(0.0))
+                least_squares(observed, pairs, map, &update.pose, self.config.sensor.noise.variance(0.0))
             }
             CorrectionConfig::MaximumAPosteriori(config) => {
-                maximum_a_posteriori(observed, pairs, map, prior, at, &self.config.line_noise, config)
+                let forgiven = (kernel == Kernel::Forgiving).then_some(&update.covariance);
+                let from = Standpoint { pose: &update.pose, forgiven };
+                maximum_a_posteriori(observed, pairs, map, prior, &from, &self.config.line_noise, config)
             }
         }
     }
@@ -781,6 +801,30 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         add(&mut c.without_segments, u32::from(update.extraction.segments == 0));
         add(&mut c.uncorrected, u32::from(!update.corrected));
         add(&mut c.crowded_out, update.extraction.crowded_out);
+    }
+}
+
+/// What the robust kernel holds against a pair.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kernel {
+    /// Its misfit: pairs that agree with the pose as it stands lead.
+    Strict,
+    /// What of its misfit the pose's own uncertainty does not explain: what most pairs agree on leads.
+    Forgiving,
+}
+
+impl Kernel {
+    /// The one to begin with.
+    fn first(prior: &Prior, config: &MapConfig) -> Self {
+        let is_close = prior.covariance.m33 < config.close_heading_rad * config.close_heading_rad;
+        if is_close { Self::Forgiving } else { Self::Strict }
+    }
+
+    fn other(self) -> Self {
+        match self {
+            Self::Strict => Self::Forgiving,
+            Self::Forgiving => Self::Strict,
+        }
     }
 }
 
