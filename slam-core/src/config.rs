@@ -122,7 +122,7 @@ impl Default for SlamConfig {
                 close_heading_rad: 0.02,
                 direction_trust_rad: 0.02,
                 observable_sigma_m: 0.1,
-                search: SearchConfig { below_support: 0.8, gain: 0.15, step_rad: 0.1, reach_rad: 0.6 },
+                search: SearchConfig { below_support: 0.8, gain: 0.2, step_rad: 0.1, reach_rad: 0.6 },
             }),
             loop_closure: Some(LoopConfig {
                 min_way_m: 20.0,

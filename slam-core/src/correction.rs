@@ -56,9 +56,9 @@ pub struct MapConfig {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SearchConfig {
-    /// The search is made when less than this share of the scan was recognised.
+    /// The search is made when less than this share of the scan was recognised: pairs weighed otherwise, other headings.
     pub below_support: f32,
-    /// Share of the scan that must be recognised more for another heading to be taken.
+    /// Share of the scan that must be recognised more for another pose to be taken.
     pub gain: f32,
     /// Distance between the headings tried, radians.
     pub step_rad: f32,
