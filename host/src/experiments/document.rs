@@ -33,9 +33,6 @@ fn corners_found<'a>(measured: impl Iterator<Item = &'a Measured> + Clone) -> St
     format!("{:.0} %", 100.0 * found as f64 / named.max(1) as f64)
 }
 
-/// Walls thicker than the reference's by no more than this factor count as equally thin.
-const AS_THIN: f64 = 1.1;
-
 /// The drives of a world under a condition.
 fn drives<'a>(
     results: &'a Results,
@@ -244,6 +241,9 @@ pub fn walls(recorded: &[Recorded]) -> Table {
     table
 }
 
+/// Walls thicker than the reference's by no more than this factor count as equally thin.
+const AS_THIN: f64 = 1.1;
+
 /// Which logs a pose graph would help, as their walls say.
 fn without_pose_graph(recorded: &[Recorded]) -> String {
     let thicker = |ours: f64, reference: f64| ours > AS_THIN * reference;
@@ -305,7 +305,7 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
          points as they stand for, as in equation (3). Its algorithm has no prior and no gate on direction: the pose is where\n\
          the pairs pull it, every segment that agrees with a wrong pose becomes map, and what the map says is hardly doubted\n\
          again. So its error grows with that of the wheels, which the pose goes back to wherever a scan fixes too little.\n\
-        With wheels as good as the robot file says, its trajectory error (rmse) is {} m in the hall and {} m in the\n\
+         With wheels as good as the robot file says, its trajectory error (rmse) is {} m in the hall and {} m in the\n\
          corridor, beside the paper's corner errors of 0.067 m and 0.234 m; with wheels that are 1 % off it is {} m and {} m.\n\
          Where corners are 0.35 m or more away from the blueprint's they are not found, so that the corner errors of `paper`\n\
          are those of the few corners near the start.",
