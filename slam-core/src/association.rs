@@ -11,7 +11,7 @@ use nalgebra::{Isometry2, Matrix3, Point2, Vector2};
 
 use crate::extraction::MAX_SEGMENTS;
 use crate::map::MapSegment;
-use crate::math::sqrt;
+use crate::math::{min, sqrt};
 use crate::nearby::Nearby;
 use crate::pose::cross;
 use crate::residual::{LineNoise, Residual};
@@ -239,8 +239,8 @@ fn gated_chi2(observed: &Segment, mapped: &Segment, view: &View<'_>, config: &Ga
     let d = mapped.direction;
     let p = view.covariance;
     let var_along = d.x * d.x * p.m11 + 2.0 * d.x * d.y * p.m12 + d.y * d.y * p.m22;
-    let slack = (2.0 * sqrt(var_along)).min(config.max_overlap_slack_m);
-    let shorter = observed.length_m().min(mapped.length_m());
+    let slack = min(2.0 * sqrt(var_along), config.max_overlap_slack_m);
+    let shorter = min(observed.length_m(), mapped.length_m());
     if mapped.overlap_m(observed) + slack < config.min_overlap * shorter {
         return None;
     }

@@ -142,6 +142,7 @@ impl Default for SlamConfig {
                 max_learning: 6,
                 taken_per_scan: 6,
                 least_gain: 0.1,
+                again_factor: 2.0,
                 max_chi2: 60.0,
                 kernel_chi2: 2.0,
                 young_hits: 4,
@@ -291,6 +292,7 @@ impl SlamConfig {
             check("registration.joint.max_taken", (1..=MAX_TAKEN).contains(&usize::from(c.max_taken)))?;
             check("registration.joint.taken_per_scan", c.taken_per_scan > 0)?;
             not_negative("registration.joint.least_gain", c.least_gain)?;
+            check("registration.joint.again_factor", c.again_factor >= 1.0 && c.again_factor.is_finite())?;
             positive("registration.joint.max_chi2", c.max_chi2)?;
             positive("registration.joint.kernel_chi2", c.kernel_chi2)?;
             positive("registration.joint.keyframes.way_m", c.keyframes.way_m)?;

@@ -12,7 +12,7 @@ use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
 use crate::association::Pair;
 use crate::map::MapSegment;
-use crate::math::sqrt;
+use crate::math::{max, min, sqrt};
 use crate::pose::{components, perpendicular, pose};
 use crate::residual::{LineNoise, Residual};
 use crate::segment::Segment;
@@ -275,7 +275,7 @@ fn judge(information: &Matrix3<f32>, direction_trust_rad: f32, observable_sigma_
 
 /// What remains of the weak direction's information when that which uncertain line directions explain is taken out.
 fn usable_information(weak: f32, strong: f32, direction_trust_rad: f32) -> f32 {
-    (weak - direction_trust_rad * direction_trust_rad * strong).max(0.0)
+    max(weak - direction_trust_rad * direction_trust_rad * strong, 0.0)
 }
 
 /// Eigenvalues and unit eigenvectors of a symmetric matrix, the larger first.
@@ -293,13 +293,13 @@ fn sorted_eigenvalues(m: &Matrix3<f32>) -> [f32; 3] {
     }
     let values = nalgebra::SymmetricEigen::try_new(*m, f32::EPSILON, 50).map(|e| e.eigenvalues);
     let [a, b, c] = values.map_or([0.0; 3], |v| [v.x, v.y, v.z]);
-    let (a, b) = (a.min(b), a.max(b));
-    let (b, c) = (b.min(c), b.max(c));
-    [a.min(b), a.max(b), c]
+    let (a, b) = (min(a, b), max(a, b));
+    let (b, c) = (min(b, c), max(b, c));
+    [min(a, b), max(a, b), c]
 }
 
 fn largest(step: &Vector3<f32>) -> f32 {
-    step.x.abs().max(step.y.abs()).max(step.z.abs())
+    max(max(step.x.abs(), step.y.abs()), step.z.abs())
 }
 
 fn finite(correction: Correction) -> Option<Correction> {

@@ -3,7 +3,8 @@
 //! A line is placed by a robot that is not sure where it stands, and is then used to say where the robot stands. Taken one
 //! by one, pose and lines would confirm each other's errors and grow sure of them. Their joint covariance knows what they
 //! have in common: an extended Kalman filter over the pose (x, y, θ), three errors of the odometry, and offset and
-//! direction of up to [`LINES`] map segments, those seen last. A segment that gives up its place keeps its own variances.
+//! direction of up to [`LINES`] map segments, those seen last. A segment that gives up its place keeps its own variances;
+//! what it had in common with others is forgotten, and made up for when it is tracked again.
 //!
 //! Errors are those about the present estimate, and are carried over when it moves: turned about the map's origin, a robot
 //! that has been moved turns about elsewhere, and a line that has been turned is shifted along another normal. Without that
@@ -17,10 +18,11 @@ use core::ops::Range;
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
 use crate::map::SegmentMap;
-use crate::math::within;
+use crate::math::{max, within};
 use crate::odometry_bias::OdometryBias;
 use crate::pose::{components, cross, perpendicular, pose};
 use crate::segment::Segment;
+use crate::told::{self, Told};
 
 /// Most map segments whose errors are tracked together: 48.
 pub const LINES: usize = 48;
@@ -29,7 +31,7 @@ const _: () = assert!(LINES <= u64::BITS as usize, "a bit for each");
 const POSE: usize = 0;
 const ODOMETRY: usize = 3;
 const FIRST_LINE: usize = 6;
-const STATES: usize = FIRST_LINE + 2 * LINES;
+pub(crate) const STATES: usize = FIRST_LINE + 2 * LINES;
 const PACKED: usize = STATES * (STATES + 1) / 2;
 /// Largest variances of the pose's position (m²) and heading (rad²). Beyond them `f32` could not tell the lines around the
 /// robot from each other any more; a robot so unsure begins anew with what it sees.
@@ -40,7 +42,7 @@ const CARRIED_RAD: f32 = 1e-3;
 /// A centroid stays where it is while the offset's variance there is larger by less than this share.
 const CENTRED_SHARE: f32 = 0.01;
 /// Least variance of a state: beneath it `f32` has no digits left.
-const LEAST_VARIANCE: f32 = 1e-12;
+pub(crate) const LEAST_VARIANCE: f32 = 1e-12;
 
 /// The joint estimate's covariance. RAM: 22 KiB.
 #[derive(Clone, Debug)]
@@ -193,16 +195,29 @@ impl Joint {
     }
 
     /// Covariance of each state with two numbers that have these derivatives.
-    fn covariance_with(&self, derivative: &Derivative) -> [[f32; STATES]; 2] {
-        let mut sums = [[0.0; STATES]; 2];
+    fn covariance_with(&self, derivative: &Derivative, sums: &mut [[f32; STATES]; 2]) {
+        *sums = [[0.0; STATES]; 2];
         if derivative.by_pose != [[0.0; 3]; 2] {
-            self.add_columns(POSE, &derivative.by_pose, &mut sums);
+            self.add_columns(POSE, &derivative.by_pose, sums);
         }
         for (place, by_line) in &derivative.by_lines {
             let [first, _] = states_of(*place);
-            self.add_columns(first, by_line, &mut sums);
+            self.add_columns(first, by_line, sums);
         }
-        sums
+    }
+
+    /// The same in the room for it, after what has been told.
+    fn covariance_after(&self, told: &mut Told, derivative: &Derivative) {
+        let (earlier, Some(with)) = told.parts() else { return };
+        self.covariance_with(derivative, with);
+        let [with_o, with_d] = with;
+        for (earlier, information) in earlier {
+            let [share_o, share_d] = derivative.times(earlier).map(|with| with * information);
+            for ((o, d), earlier) in with_o.iter_mut().zip(with_d.iter_mut()).zip(earlier) {
+                *o -= share_o * earlier;
+                *d -= share_d * earlier;
+            }
+        }
     }
 
     /// Adds the covariances of all states with some that lie side by side, so many times each, to two sums.
@@ -335,8 +350,13 @@ impl Joint {
     }
 
     /// The place of a map segment among the lines; it is given one if it has none, at the cost of the segment not seen
-    /// for longest. `None` when all lines tracked were seen in the scan at hand.
-    pub(crate) fn track<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) -> Option<usize> {
+    /// for longest, and with its own variances so many times. `None` when all lines tracked were seen in the scan at hand.
+    pub(crate) fn track<const N: usize>(
+        &mut self,
+        index: usize,
+        again_factor: f32,
+        map: &mut SegmentMap<N>,
+    ) -> Option<usize> {
         if let Some(place) = self.place_of(index) {
             self.in_use |= 1 << place;
             return Some(place);
@@ -346,7 +366,7 @@ impl Joint {
         *self.owners.get_mut(place)? = u16::try_from(index).ok();
         *self.ages_scans.get_mut(place)? = f32::INFINITY;
         for (state, variance) in states_of(place).into_iter().zip(variances(&segment)) {
-            self.set(state, state, variance);
+            self.set(state, state, again_factor * variance);
         }
         Some(place)
     }
@@ -433,24 +453,60 @@ impl Joint {
     /// Takes in a measurement, as far as it deserves it; false where it does not. Work: with [`Learning::All`] the square of the
     /// number of states, otherwise that number, some times.
     pub(crate) fn measure(&mut self, measurement: &Measurement, trust: &Trust, learning: Learning) -> bool {
-        let mut with = self.covariance_with(&measurement.by);
+        let mut told = Told::new();
+        let is_taken = self.learn_from(measurement, trust, learning, &mut told);
+        self.take_out(&mut told);
+        is_taken
+    }
+
+    /// The same for several measurements one after the other, with less work.
+    pub(crate) fn measure_all<'a>(
+        &mut self,
+        measurements: impl Iterator<Item = (&'a Measurement, Learning)>,
+        trust: &Trust,
+    ) {
+        let mut told = Told::new();
+        for (measurement, learning) in measurements {
+            if !told.has_room() {
+                self.take_out(&mut told);
+            }
+            self.learn_from(measurement, trust, learning, &mut told);
+        }
+        self.take_out(&mut told);
+    }
+
+    fn take_out(&mut self, told: &mut Told) {
+        let states = self.states();
+        told.take_out(&mut self.covariance, states);
+    }
+
+    /// Takes in a measurement but for what everything has learnt of the covariance, which is told.
+    fn learn_from(
+        &mut self,
+        measurement: &Measurement,
+        trust: &Trust,
+        learning: Learning,
+        told: &mut Told,
+    ) -> bool {
+        self.covariance_after(told, &measurement.by);
+        let Some(with) = told.at_hand::<2>() else { return false };
         let [[o_with_o, d_with_o], [_, d_with_d]] = with.each_ref().map(|with| measurement.by.times(with));
         let known = Matrix2::new(o_with_o, d_with_o, d_with_o, d_with_d);
         let weighed = Weighed::new(self.errors(measurement), &known, measurement);
         if weighed.chi2.is_nan() || weighed.chi2 > trust.max_chi2 {
             return false;
         }
-        let factor = (weighed.chi2 / trust.kernel_chi2).max(1.0);
+        let factor = max(weighed.chi2 / trust.kernel_chi2, 1.0);
         let noise = measurement.variances.map(|variance| variance * factor);
         let [offset, direction] = weighed.gains.map(|gain| gain >= trust.least_gain);
         match learning {
             // What only a line learns, the robot does not know when it is told the next.
             Learning::Line(_) if offset && direction => {
-                self.take_in(measurement, &mut with, noise, [true, false], learning);
-                with = self.covariance_with(&measurement.by);
-                self.take_in(measurement, &mut with, noise, [false, true], learning);
+                self.take_in(measurement, noise, [true, false], learning, told);
+                self.covariance_after(told, &measurement.by);
+                self.take_in(measurement, noise, [false, true], learning, told);
             }
-            _ => self.take_in(measurement, &mut with, noise, [offset, direction], learning),
+            _ => self.take_in(measurement, noise, [offset, direction], learning, told),
         }
         true
     }
@@ -460,19 +516,21 @@ impl Joint {
     fn take_in(
         &mut self,
         measurement: &Measurement,
-        with: &mut [[f32; STATES]; 2],
         noise: [f32; 2],
         taken: [bool; 2],
         learning: Learning,
+        told: &mut Told,
     ) {
-        let [[o_with_o, d_with_o], [_, d_with_d]] = with.each_ref().map(|with| measurement.by.times(with));
-        let ([with_o, with_d], errors) = (with, self.errors(measurement));
-        let told = |taken, number: &Number| {
+        let (_, Some([with_o, with_d])) = told.parts() else { return };
+        let [[o_with_o, d_with_o], [_, d_with_d]] =
+            [&*with_o, &*with_d].map(|with| measurement.by.times(with));
+        let errors = self.errors(measurement);
+        let tells = |taken, number: &Number| {
             taken && number.variance > 0.0 && number.variance.is_finite() && number.error.is_finite()
         };
         let offset = Number { error: errors[0], variance: o_with_o + noise[0] };
         let mut direction = Number { error: errors[1], variance: d_with_d + noise[1] };
-        let with_offset = told(taken[0], &offset);
+        let with_offset = tells(taken[0], &offset);
         if with_offset && taken[1] {
             // What the direction says beyond what the offset has told.
             let share = d_with_o / offset.variance;
@@ -480,16 +538,20 @@ impl Joint {
             direction.error -= share * offset.error;
             direction.variance -= share * d_with_o;
         }
-        match (with_offset, told(taken[1], &direction)) {
-            (true, true) => self.learn([with_o, with_d], [offset, direction], learning),
-            (true, false) => self.learn([with_o], [offset], learning),
-            (false, true) => self.learn([with_d], [direction], learning),
+        match (with_offset, tells(taken[1], &direction)) {
+            (true, true) => self.learn([offset, direction], learning, told),
+            (true, false) => self.learn([offset], learning, told),
+            (false, true) => {
+                *with_o = *with_d;
+                self.learn([direction], learning, told);
+            }
             (false, false) => {}
         }
     }
 
-    /// Learns from numbers that are independent of each other, and of which each state has these covariances.
-    fn learn<const K: usize>(&mut self, with: [&[f32; STATES]; K], numbers: [Number; K], learning: Learning) {
+    /// Learns from numbers that are independent of each other.
+    fn learn<const K: usize>(&mut self, numbers: [Number; K], learning: Learning, told: &mut Told) {
+        let Some(with) = told.at_hand::<K>() else { return };
         for range in learning.states() {
             for (with, number) in with.iter().zip(&numbers) {
                 let by = number.error / number.variance;
@@ -498,14 +560,18 @@ impl Joint {
                 shifts.iter_mut().zip(with).for_each(|(shift, with)| *shift -= with * by);
             }
         }
-        self.lower(with, numbers.map(|number| 1.0 / number.variance), learning);
+        let information = numbers.map(|number| 1.0 / number.variance);
+        match learning {
+            Learning::All => told.add(information),
+            Learning::RobotAndLine(_) | Learning::Line(_) => self.lower_some(with, information, learning),
+        }
     }
 
-    /// Takes from the covariance what such numbers have told; given are the inverses of their variances. What does not learn
-    /// has no gain; the gains of the others are those of the whole filter.
-    fn lower<const K: usize>(
+    /// Takes from the covariance what numbers of this information have told those that learn. What does not learn has no
+    /// gain; the gains of the others are those of the whole filter.
+    fn lower_some<const K: usize>(
         &mut self,
-        with: [&[f32; STATES]; K],
+        with: &[[f32; STATES]; K],
         information: [f32; K],
         learning: Learning,
     ) {
@@ -515,19 +581,13 @@ impl Joint {
         for state in 0..states {
             let Some((row, below)) = rest.split_at_mut_checked(state + 1) else { return };
             rest = below;
-            let mut gains = information;
-            gains
-                .iter_mut()
-                .zip(&with)
-                .for_each(|(gain, with)| *gain *= with.get(state).copied().unwrap_or(0.0));
+            let gains = told::gains(with, information, state);
             if gains == [0.0; K] {
                 continue;
             }
             if ranges.iter().any(|range| range.contains(&state)) {
                 subtract(row, 0, with, gains);
-                if let Some(variance) = row.last_mut() {
-                    *variance = if *variance >= LEAST_VARIANCE { *variance } else { LEAST_VARIANCE };
-                }
+                row.iter_mut().last().into_iter().for_each(told::keep_above_least);
                 continue;
             }
             // What it has in common with those that do learn.
@@ -607,7 +667,7 @@ impl Joint {
             }
             at += row + 1;
         }
-        self.set(state, state, own.max(0.0));
+        self.set(state, state, max(own, 0.0));
     }
 
     /// The segment with its centroid where offset and direction are independent, within its ends, and with its variances
@@ -638,10 +698,10 @@ impl Joint {
     /// Variance of a line's state if the pose were known.
     fn given_pose(&self, state: usize, pose_information: Option<&Matrix3<f32>>) -> f32 {
         // Rounding may have taken a variance below zero, and a range must not be empty.
-        let own = self.get(state, state).max(LEAST_VARIANCE);
+        let own = max(self.get(state, state), LEAST_VARIANCE);
         let with = Vector3::from_fn(|i, _| self.get(POSE + i, state));
         let explained = pose_information.map_or(0.0, |w| with.dot(&(w * with)));
-        within(own - explained, 0.01 * own, own).max(LEAST_VARIANCE)
+        max(within(own - explained, 0.01 * own, own), LEAST_VARIANCE)
     }
 
     /// Tracks a segment just added to the map, seen from the pose with these variances of its own.
@@ -660,7 +720,8 @@ impl Joint {
         let by_pose = by_pose(segment.normal(), segment.moments.centroid.coords - position);
         let seen = Derivative { by_pose, by_lines: heapless::Vec::new() };
         let place = self.free_place(map);
-        let with = self.covariance_with(&seen);
+        let mut with = [[0.0; STATES]; 2];
+        self.covariance_with(&seen, &mut with);
         let [[o_with_o, d_with_o], [_, d_with_d]] = with.each_ref().map(|with| seen.times(with));
         let (var_offset, var_direction) = (o_with_o + var_offset, d_with_d + var_direction);
         let Some(place) = place else {
@@ -749,31 +810,12 @@ impl Learning {
     }
 }
 
-/// Takes so many times each of some vectors, from an index on, from the values. The heart of the joint estimate: four at a time, so
-/// that the microcontroller need not count so often.
+/// Takes so many times each of some vectors, from an index on, from the values.
 #[inline]
-fn subtract<const K: usize>(from: &mut [f32], begin: usize, with: [&[f32; STATES]; K], times: [f32; K]) {
-    let with = with.map(|values| values.get(begin..begin + from.len()).unwrap_or_default().as_chunks::<4>());
-    let (fours, rest) = from.as_chunks_mut::<4>();
-    match (with.as_slice(), times.as_slice()) {
-        // Two at once: a value is loaded and stored but once.
-        (&[(a, _), (b, _)], &[times_a, times_b]) => {
-            for ((four, a), b) in fours.iter_mut().zip(a).zip(b) {
-                for ((value, a), b) in four.iter_mut().zip(a).zip(b) {
-                    *value = *value - times_a * a - times_b * b;
-                }
-            }
-        }
-        _ => {
-            for ((others, _), times) in with.iter().zip(times) {
-                for (four, others) in fours.iter_mut().zip(*others) {
-                    four.iter_mut().zip(others).for_each(|(value, other)| *value -= times * other);
-                }
-            }
-        }
-    }
-    for ((_, others), times) in with.iter().zip(times) {
-        rest.iter_mut().zip(*others).for_each(|(value, other)| *value -= times * other);
+fn subtract<const K: usize>(from: &mut [f32], begin: usize, with: &[[f32; STATES]; K], times: [f32; K]) {
+    for (with, times) in with.iter().zip(times) {
+        let with = with.get(begin..begin + from.len()).unwrap_or_default();
+        from.iter_mut().zip(with).for_each(|(value, with)| *value -= times * with);
     }
 }
 
@@ -818,7 +860,7 @@ fn states_of(place: usize) -> [usize; 2] {
 
 /// Variances of a segment's offset and direction, as its sums say.
 pub(crate) fn variances(segment: &Segment) -> [f32; 2] {
-    let variance = |information: f32| 1.0 / information.max(1e-9);
+    let variance = |information: f32| 1.0 / max(information, 1e-9);
     [variance(segment.moments.weight), variance(segment.moments.scatter_along(segment.direction))]
 }
 
@@ -826,8 +868,8 @@ pub(crate) fn variances(segment: &Segment) -> [f32; 2] {
 pub(crate) fn with_variances(segment: &Segment, var_offset: f32, var_direction: f32) -> Segment {
     let mut segment = *segment;
     let d = segment.direction;
-    let information = 1.0 / var_direction.max(LEAST_VARIANCE);
-    segment.moments.weight = 1.0 / var_offset.max(LEAST_VARIANCE);
+    let information = 1.0 / max(var_direction, LEAST_VARIANCE);
+    segment.moments.weight = 1.0 / max(var_offset, LEAST_VARIANCE);
     segment.moments.scatter = [d.x * d.x * information, d.x * d.y * information, d.y * d.y * information];
     segment
 }
@@ -854,6 +896,8 @@ mod tests {
         sigma_heading_floor_rad: 0.001,
     };
     const SEEN: [f32; 2] = [1e-4, 4e-4];
+    const SURE: [f32; 2] = [1e-5, 4e-5];
+    const AGAIN: f32 = 2.0;
     const PLAIN: Trust = Trust { max_chi2: f32::INFINITY, kernel_chi2: f32::INFINITY, least_gain: 0.0 };
 
     struct Gauss(rand_pcg::Pcg32);
@@ -936,7 +980,7 @@ mod tests {
                     new.push((i, with_variances(&noisy, SEEN[0], SEEN[1])));
                     continue;
                 };
-                let place = self.joint.track(index, &mut self.map).unwrap();
+                let place = self.joint.track(index, AGAIN, &mut self.map).unwrap();
                 let entry = self.map.get_mut(index).unwrap();
                 entry.last_seen = self.scan;
                 let position = self.believed.translation.vector;
@@ -1011,7 +1055,7 @@ mod tests {
         world.step(0.1, Vector3::zeros());
         let before = world.joint.clone();
         let entry = world.map.segments()[0];
-        let place = world.joint.track(0, &mut world.map).unwrap();
+        let place = world.joint.track(0, AGAIN, &mut world.map).unwrap();
         let seen = entry.segment.shifted(0.05, 0.1);
         let position = world.believed.translation.vector;
         let measurement =
@@ -1037,7 +1081,8 @@ mod tests {
             let measurement =
                 Measurement::of_pair(place, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
             let weighed = world.joint.weigh(&measurement);
-            let with = world.joint.covariance_with(&measurement.by);
+            let mut with = [[0.0; STATES]; 2];
+            world.joint.covariance_with(&measurement.by, &mut with);
             for (state, [o, d]) in (0..STATES).map(|state| (state, [with[0][state], with[1][state]])) {
                 let plain = measurement.by.entries().fold([0.0; 2], |sums, (i, [by_o, by_d])| {
                     let value = world.joint.get(state, i);
@@ -1055,6 +1100,66 @@ mod tests {
             assert!(!doubting.measure(&measurement, &least(0.99 * weighed.chi2), Learning::All));
             assert!(doubting.measure(&measurement, &least(1.01 * weighed.chi2), Learning::All));
         }
+    }
+
+    /// Whoever learns from them: all, and in between the robot with a line, or a line alone.
+    #[test]
+    fn several_measurements_at_once_say_what_they_say_one_by_one() {
+        let mut world = World::new(9);
+        world.look();
+        (0..30).for_each(|_| world.step(0.1, Vector3::zeros()));
+        let position = world.believed.translation.vector;
+        let tracked = (0..world.map.segments().len()).filter_map(|i| Some((i, world.joint.place_of(i)?)));
+        let measurements: std::vec::Vec<_> = tracked
+            .map(|(index, place)| {
+                let segment = world.map.segments()[index].segment;
+                let seen = segment.shifted(0.01 * world.gauss.draw(), 0.02 * world.gauss.draw());
+                let since = Vector3::zeros();
+                let learning = match index % 5 {
+                    2 => Learning::RobotAndLine(place),
+                    4 => Learning::Line(place),
+                    _ => Learning::All,
+                };
+                (Measurement::of_pair(place, &segment, &seen, position, &since, SURE), learning)
+            })
+            .collect();
+        assert!(measurements.len() > 8);
+        let (mut one_by_one, mut at_once) = (world.joint.clone(), world.joint.clone());
+        // Some numbers are passed over.
+        let trust = Trust { kernel_chi2: 2.0, least_gain: 0.05, ..PLAIN };
+        for (measurement, learning) in &measurements {
+            one_by_one.measure(measurement, &trust, *learning);
+        }
+        at_once.measure_all(measurements.iter().map(|(m, learning)| (m, *learning)), &trust);
+        for i in 0..STATES {
+            let sigma = world.joint.get(i, i).sqrt();
+            assert!((one_by_one.shift[i] - at_once.shift[i]).abs() <= 1e-3 * sigma, "{i}");
+            for j in 0..=i {
+                let most = sigma * world.joint.get(j, j).sqrt();
+                assert!((one_by_one.get(i, j) - at_once.get(i, j)).abs() <= 1e-4 * most, "{i} {j}");
+            }
+        }
+        let surer = |i: usize| at_once.get(i, i) < 0.9 * world.joint.get(i, i);
+        let count = (0..STATES).filter(|i| surer(*i)).count();
+        assert!(count > 10, "{count} states have learnt");
+    }
+
+    #[test]
+    fn a_segment_that_is_tracked_again_counts_for_less_than_it_says_of_itself() {
+        let mut world = World::new(7);
+        world.look();
+        let index = 3;
+        let place = world.joint.place_of(index).unwrap();
+        world.joint.release(place, &mut world.map);
+        let own = variances(&world.map.segments()[index].segment);
+        let place = world.joint.track(index, AGAIN, &mut world.map).unwrap();
+        for (state, own) in states_of(place).into_iter().zip(own) {
+            assert_eq!(world.joint.get(state, state), AGAIN * own);
+            assert_eq!(world.joint.get(POSE, state), 0.0);
+        }
+        // One that is tracked stays as it is.
+        assert_eq!(world.joint.track(index, AGAIN, &mut world.map), Some(place));
+        assert_eq!(world.joint.get(states_of(place)[0], states_of(place)[0]), AGAIN * own[0]);
     }
 
     /// The map has dropped a segment for a new one, at the same index.

@@ -66,6 +66,7 @@
     not(test),
     deny(clippy::indexing_slicing, clippy::unwrap_used, clippy::expect_used, clippy::panic)
 )]
+#![cfg_attr(test, allow(clippy::disallowed_methods))]
 
 #[cfg(test)]
 extern crate std;
@@ -91,6 +92,7 @@ pub mod residual;
 pub mod scan;
 pub mod segment;
 pub mod slam;
+mod told;
 pub mod visibility;
 
 pub use config::{ConfigError, SlamConfig};

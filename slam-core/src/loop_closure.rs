@@ -11,7 +11,7 @@
 use nalgebra::{Isometry2, Matrix3, Vector2};
 
 use crate::map::MapSegment;
-use crate::math::{sin_cos, wrap_angle};
+use crate::math::{min, sin_cos, wrap_angle};
 use crate::pose::{components, pose};
 
 /// Settings of loop closure.
@@ -92,7 +92,7 @@ impl Closure {
         if seen_at_m <= self.loop_began_m || length_m <= 0.0 {
             return Isometry2::identity();
         }
-        let share = ((seen_at_m - self.loop_began_m) / length_m).min(1.0);
+        let share = min((seen_at_m - self.loop_began_m) / length_m, 1.0);
         let (from, to) = (components(&self.drifted), components(&self.closed));
         let turn = share * wrap_angle(to.z - from.z);
         let shift = (to.xy() - from.xy()) * share;

@@ -5,6 +5,7 @@
 
 use heapless::Vec;
 
+use crate::math::max;
 use crate::segment::Segment;
 
 /// A segment of the map, 64 bytes.
@@ -119,7 +120,7 @@ impl<const N: usize> SegmentMap<N> {
             kept.segment.moments.inliers.saturating_add(taken.segment.moments.inliers);
         kept.hits = kept.hits.max(taken.hits);
         kept.last_seen = kept.last_seen.max(taken.last_seen);
-        kept.seen_at_m = kept.seen_at_m.max(taken.seen_at_m);
+        kept.seen_at_m = max(kept.seen_at_m, taken.seen_at_m);
         self.counters.fused = self.counters.fused.saturating_add(1);
     }
 

@@ -51,7 +51,20 @@ pub fn sqrt(value: f32) -> f32 {
 /// panics then, and its message brings the printing of floats with it: 15 kB of flash.
 #[inline]
 pub fn within(value: f32, low: f32, high: f32) -> f32 {
-    value.min(high).max(low)
+    max(min(value, high), low)
+}
+
+/// The larger of two values; the second where the first is NaN. Three instructions; `f32::max` is a call into a library on a
+/// Cortex-M4F.
+#[inline]
+pub fn max(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// The smaller of two values; the second where the first is NaN.
+#[inline]
+pub fn min(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
 }
 
 /// Wraps an angle in radians to (-π, π]. NaN and infinities give NaN.

@@ -6,6 +6,7 @@
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Vector2};
 
+use crate::math::min;
 use crate::pose::{cross, perpendicular};
 use crate::segment::Segment;
 
@@ -69,7 +70,7 @@ impl Residual {
             + noise.var_offset();
         let var_angle = var_observed_angle
             + var_map_angle
-            + noise.var_direction(observed.length_m().min(mapped.length_m()));
+            + noise.var_direction(min(observed.length_m(), mapped.length_m()));
         // A map line turned by δ is along·δ away at the observed centroid: both errors have that in common.
         let common = along * var_map_angle;
         if !(var_offset.is_finite() && var_angle.is_finite()) {

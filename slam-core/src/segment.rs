@@ -9,7 +9,7 @@
 
 use nalgebra::{Isometry2, Point2, Vector2};
 
-use crate::math::sqrt;
+use crate::math::{max, min, sqrt};
 use crate::pose::{cross, perpendicular};
 
 /// Weighted sums over points of the plane. A weight is the inverse variance of the point, 1/m².
@@ -115,7 +115,7 @@ impl Moments {
     pub fn scatter_along(&self, direction: Vector2<f32>) -> f32 {
         let [xx, xy, yy] = self.scatter;
         let (x, y) = (direction.x, direction.y);
-        (x * x * xx + 2.0 * x * y * xy + y * y * yy).max(0.0)
+        max(x * x * xx + 2.0 * x * y * xy + y * y * yy, 0.0)
     }
 
     /// Weighted sum of squared distances from the fitted line: χ² of the fit.
@@ -214,7 +214,7 @@ impl Segment {
         let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
         for point in extremes {
             let s = direction.dot(&(point - moments.centroid));
-            (least, most) = (least.min(s), most.max(s));
+            (least, most) = (min(s, least), max(s, most));
         }
         if least > most {
             (least, most) = (0.0, 0.0);
@@ -255,7 +255,7 @@ impl Segment {
     pub fn overlap_m(&self, other: &Self) -> f32 {
         let (a, b) = (self.along_of(self.start), self.along_of(self.end));
         let (c, d) = (self.along_of(other.start), self.along_of(other.end));
-        b.min(c.max(d)) - a.max(c.min(d))
+        min(b, max(c, d)) - max(a, min(c, d))
     }
 
     /// Whether every number is finite.

@@ -17,7 +17,7 @@ use crate::joint::Joint;
 use crate::keyframe::{AmongLines, Keyframe, Settled};
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapCounters, MapSegment, SegmentMap};
-use crate::math::{sqrt, within, wrap_angle};
+use crate::math::{max, min, sqrt, within, wrap_angle};
 use crate::nearby::Nearby;
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
@@ -566,7 +566,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
         let increment = &motion.since_previous;
         let moved =
-            if increment.is_finite() { (increment.distance_m + increment.turn_rad).min(1.0) } else { 1.0 };
+            if increment.is_finite() { min(increment.distance_m + increment.turn_rad, 1.0) } else { 1.0 };
         let reach_rad = config.reach_rad * moved;
         let broad = Prior { covariance: broadened(prior, &self.map_from_base, 0.5 * reach_rad), ..*prior };
         let centre = components(&prior.pose);
@@ -598,7 +598,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         watch(Stage::Association);
         let (map, way_m) = (self.map.segments(), self.way_m);
         let age = |i: &u16| map.get(usize::from(*i)).map_or(0.0, |s| way_m - s.seen_at_m);
-        let oldest = self.nearby.all().iter().map(age).fold(0.0, f32::max);
+        let oldest = self.nearby.all().iter().map(age).fold(0.0, max);
         if oldest < config.min_way_m {
             return;
         }
@@ -617,7 +617,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             chi2_between(&hypothesis.pose, &update.pose, &j.pose_covariance()) <= config.max_chi2
         });
         let began = self.pairs.iter().filter_map(|p| self.map.segments().get(p.mapped)).map(|s| s.seen_at_m);
-        let loop_began_m = began.fold(0.0, f32::max);
+        let loop_began_m = began.fold(0.0, max);
         if seen && drifted && likely {
             let closure = Closure { drifted: update.pose, closed: hypothesis.pose, loop_began_m, way_m };
             if self.closing.confirmed_by(&closure, config) {

@@ -1,5 +1,7 @@
 //! The whole pipeline: it never panics, it is reproducible, and it finds its way in a room.
 
+#![allow(clippy::disallowed_methods)]
+
 use nalgebra::{Isometry2, Point2, Vector2};
 use proptest::prelude::*;
 use slam_core::correction::Verdict;

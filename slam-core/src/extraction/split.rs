@@ -15,7 +15,7 @@ use nalgebra::{Point2, Vector2};
 use super::strip::{Frame, Sums, VarianceAcross};
 use super::{Collector, Viewpoint};
 use crate::deskew::ScanPoint;
-use crate::math::{sin_cos, sqrt};
+use crate::math::{max, min, sin_cos, sqrt};
 use crate::segment::{Moments, Segment};
 
 /// Pieces waiting to be looked at. Each split adds one; deeper clusters give up their smallest detail.
@@ -85,7 +85,7 @@ pub(crate) fn extract(
     config: &SplitConfig,
     out: &mut Collector<'_>,
 ) {
-    let sin_incidence = sin_cos(config.min_incidence_rad).0.max(1e-3);
+    let sin_incidence = max(sin_cos(config.min_incidence_rad).0, 1e-3);
     let spacing_per_m = view.sensor.geometry.step_rad() / sin_incidence;
     let extraction = Extraction { view, config, variance: VarianceAcross::new(view), spacing_per_m };
     let mut rest = points;
@@ -109,8 +109,8 @@ impl Extraction<'_> {
         if apart2 <= self.config.max_gap_m * self.config.max_gap_m {
             return true;
         }
-        let range_m = a.range_m.min(b.range_m);
-        let gap_m = self.config.max_gap_m.max(self.spacing_per_m * range_m * f32::from(beams));
+        let range_m = min(a.range_m, b.range_m);
+        let gap_m = max(self.spacing_per_m * range_m * f32::from(beams), self.config.max_gap_m);
         // Noise alone sets neighbours √2·σ apart along the beam; a wall must not end where it happens to.
         let variance = 2.0 * self.view.sensor.noise.variance(range_m);
         let limit_m = gap_m + self.config.split_sigmas * sqrt(variance);
@@ -343,5 +343,5 @@ fn is_one_line(a: &Moments, b: &Moments, config: &SplitConfig) -> bool {
 
 /// χ² that joining two pieces of one line may cost, by the points of the smaller.
 fn joining_limit(fewer: u32, config: &SplitConfig) -> f32 {
-    (config.merge_chi2 * fewer as f32).max(CHANCE_CHI2)
+    max(config.merge_chi2 * fewer as f32, CHANCE_CHI2)
 }

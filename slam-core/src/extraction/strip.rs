@@ -7,7 +7,7 @@ use nalgebra::{Point2, Vector2};
 
 use super::Viewpoint;
 use crate::deskew::ScanPoint;
-use crate::math::sqrt;
+use crate::math::{max, sqrt};
 use crate::pose::perpendicular;
 use crate::segment::Moments;
 
@@ -196,7 +196,7 @@ impl Sums {
     /// χ² of the line that fits best, regressed on the frame's.
     pub fn residual(&self) -> f32 {
         let [ss, so, oo] = self.central();
-        (if ss > 0.0 { oo - so * so / ss } else { oo }).max(0.0)
+        max(if ss > 0.0 { oo - so * so / ss } else { oo }, 0.0)
     }
 }
 
