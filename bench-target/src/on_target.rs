@@ -178,7 +178,12 @@ fn functions() {
         |k| both(F32Ext::sin_cos(angle(k))),
         |k| libm::sin(wide(k)) + libm::cos(wide(k)),
     );
-    function("sqrt", |k| libm::sqrtf(k as f32), |k| F32Ext::sqrt(k as f32), |k| libm::sqrt(f64::from(k)));
+    function(
+        "sqrt",
+        |k| slam_core::math::sqrt(k as f32),
+        |k| F32Ext::sqrt(k as f32),
+        |k| libm::sqrt(f64::from(k)),
+    );
 }
 
 fn function(

@@ -283,7 +283,9 @@ impl Report {
         println!("\ncycles for each of them by the model, median / p99 / max");
         cycles.print_stages();
         let strange = self.print_causes();
-        println!("\nfunction: instructions and largest error of libm (sin_cos: of the core), of micromath");
+        println!(
+            "\nfunction: instructions and largest error of libm (sin_cos and sqrt: of the core), of micromath"
+        );
         for Function { name, instructions: [ours, micromath], errors: [error, micromath_error] } in
             &instructions.functions
         {

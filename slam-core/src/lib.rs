@@ -1,6 +1,6 @@
 //! Line-segment SLAM for a microcontroller: a laser scanner, two wheel encoders, a map of line segments in fixed
-//! memory. No allocation, no `unsafe`, no clock, no panic; plain `f32` and one `libm`, so that every machine computes
-//! the same bits (tested on the PC and on a Cortex-M4F in emulation).
+//! memory. No allocation, no `unsafe`, no clock, no panic; plain `f32`, one `libm` and the root of IEEE 754, so that
+//! every machine computes the same bits (tested on the PC and on a Cortex-M4F in emulation).
 //!
 //! The algorithm is that of "Least-square Matching for Mobile Robot SLAM Based on Line-segment Model":
 //! [`SlamConfig::paper`] is the paper step for step, [`SlamConfig::default`] our best, through the same pipeline.

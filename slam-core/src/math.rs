@@ -1,7 +1,7 @@
 //! Every transcendental function of the crate, in one place.
 //!
 //! They are `libm`'s or written out here, on the PC as on the microcontroller, so that the same input gives the same bits on
-//! both. nalgebra reaches the same functions through its `libm-force` feature.
+//! both; the square root is the FPU's, which is rounded correctly everywhere. nalgebra reaches the same functions through its `libm-force` feature.
 
 use core::f32::consts::PI;
 
@@ -44,7 +44,7 @@ pub fn atan2(y: f32, x: f32) -> f32 {
 /// Square root; negative arguments, which only rounding can produce here, give zero. NaN stays NaN.
 #[inline]
 pub fn sqrt(value: f32) -> f32 {
-    if value < 0.0 { 0.0 } else { libm::sqrtf(value) }
+    if value < 0.0 { 0.0 } else { vsqrt::sqrt(value) }
 }
 
 /// A value kept within limits; NaN gives the upper one, and where they are in the wrong order the lower wins. `f32::clamp`
