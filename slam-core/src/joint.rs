@@ -587,7 +587,7 @@ impl Joint {
             }
             if ranges.iter().any(|range| range.contains(&state)) {
                 subtract(row, 0, with, gains);
-                row.iter_mut().last().into_iter().for_each(told::keep_above_least);
+                row.last_mut().into_iter().for_each(told::keep_above_least);
                 continue;
             }
             // What it has in common with those that do learn.
