@@ -23,7 +23,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use capstone::arch::arm::{ArchExtraMode, ArchMode, ArmInsnDetail, ArmOperand, ArmOperandType, ArmReg};
 use capstone::prelude::*;
 use object::{Object, ObjectSection, ObjectSymbol, SectionKind};
@@ -286,6 +286,13 @@ impl Tally {
         cycles as f64 / self.of(Cause::Instructions).max(1) as f64
     }
 
+    /// Fails where instructions were executed that the model does not know: they counted for one cycle each.
+    pub fn check_known(&self) -> anyhow::Result<()> {
+        let unknown = self.of(Cause::Unknown);
+        ensure!(unknown == 0, "{unknown} instructions are not in the disassembled code");
+        Ok(())
+    }
+
     fn add(&self, cause: Cause, number: u64) -> u64 {
         if number > 0 {
             self.counts[cause as usize].fetch_add(number, Ordering::Relaxed);
@@ -465,6 +472,17 @@ mod tests {
             all.iter().map(|(_, i)| i.literal).collect::<Vec<_>>(),
             [None, Some(0x0800_000c), Some(0x0800_0010)]
         );
+    }
+
+    #[test]
+    fn an_instruction_that_is_not_in_the_code_is_told_of() {
+        let program = Program::of(&decoded(&[0xbf00, 0xbf00])).unwrap();
+        let (mut model, tally) = (Model::default(), Tally::default());
+        let start = program.start;
+        model.step(&program, &tally, start, start + 2);
+        assert!(tally.check_known().is_ok());
+        model.step(&program, &tally, 0x2000_0000, start);
+        assert!(tally.check_known().unwrap_err().to_string().starts_with("1 instructions"));
     }
 
     #[test]

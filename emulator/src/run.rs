@@ -153,6 +153,9 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
     if let Some(error) = finished.session.take_error() {
         return Err(error.into());
     }
+    if let Some(pace) = &pace {
+        pace.tally.check_known()?;
+    }
     let stop = finished.stop.context("the run ended by itself")?;
     let resets =
         finished.session.resets().iter().map(|r| (r.at.0 / 1000, format!("{:?}", r.cause))).collect();
