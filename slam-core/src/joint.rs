@@ -459,7 +459,8 @@ impl Joint {
         is_taken
     }
 
-    /// The same for several measurements one after the other, with less work.
+    /// The same for several measurements one after the other, with less work. One of a line that has been forgotten says
+    /// nothing.
     pub(crate) fn measure_all<'a>(
         &mut self,
         measurements: impl Iterator<Item = (&'a Measurement, Learning)>,
@@ -467,6 +468,9 @@ impl Joint {
     ) {
         let mut told = Told::new();
         for (measurement, learning) in measurements {
+            if measurement.by.by_lines.iter().any(|(place, _)| self.owner(*place).is_none()) {
+                continue;
+            }
             if !told.has_room() {
                 self.take_out(&mut told);
             }

@@ -1,7 +1,8 @@
 //! Every transcendental function of the crate, in one place.
 //!
 //! They are `libm`'s or written out here, on the PC as on the microcontroller, so that the same input gives the same bits on
-//! both; the square root is the FPU's, which is rounded correctly everywhere. nalgebra reaches the same functions through its `libm-force` feature.
+//! both; the square root is the FPU's, which is rounded correctly everywhere, as `libm`'s is. nalgebra reaches `libm`
+//! through its `libm-force` feature.
 
 use core::f32::consts::PI;
 
@@ -54,8 +55,7 @@ pub fn within(value: f32, low: f32, high: f32) -> f32 {
     max(min(value, high), low)
 }
 
-/// The larger of two values; the second where the first is NaN. Three instructions; `f32::max` is a call into a library on a
-/// Cortex-M4F.
+/// The larger of two values; the second where the first is NaN. In line; `f32::max` is a call into a library on a Cortex-M4F.
 #[inline]
 pub fn max(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }

@@ -230,8 +230,6 @@ struct Made {
 #[derive(Clone, Debug)]
 struct Sighting {
     measurement: Measurement,
-    /// Of the map segment among the lines tracked.
-    place: usize,
     learning: Learning,
 }
 
@@ -288,7 +286,7 @@ impl Sightings {
                     place => Learning::RobotAndLine(place),
                 };
                 // There is room for as many as may be taken.
-                let _ = self.list.push(Sighting { measurement, place, learning });
+                let _ = self.list.push(Sighting { measurement, learning });
             }
             if let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
             {
@@ -318,13 +316,10 @@ impl Sightings {
     ///
     /// Work: for each from which everything learns the square of the number of states tracked, for the others that number.
     pub fn take_in(&mut self, most: usize, config: &JointConfig, joint: &mut Joint) -> bool {
-        let waiting = self.list.get(self.taken..).unwrap_or_default();
-        let now = waiting.get(..most.min(waiting.len())).unwrap_or_default();
-        // A line that has been forgotten since is no more.
-        let remain = now.iter().filter(|sighting| joint.owner(sighting.place).is_some());
-        let remain: Vec<_, MAX_TAKEN> = remain.map(|s| (&s.measurement, s.learning)).collect();
-        joint.measure_all(remain.into_iter(), &config.trust());
-        self.taken += now.len();
+        let end = self.list.len().min(self.taken.saturating_add(most));
+        let now = self.list.get(self.taken..end).unwrap_or_default();
+        joint.measure_all(now.iter().map(|s| (&s.measurement, s.learning)), &config.trust());
+        self.taken = end;
         !now.is_empty()
     }
 

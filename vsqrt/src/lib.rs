@@ -1,7 +1,7 @@
 //! Square root by the instruction for it, where the core has one.
 //!
-//! `core` has no square root, and `libm`'s takes 76 instructions on a Cortex-M4F, whose FPU does it with one. Both are rounded
-//! correctly, as IEEE 754 asks, so that every machine gives the same bits. The only `unsafe` code of the map is here.
+//! `core` has no square root, and `libm`'s is written in integers where the FPU of a Cortex-M4F has an instruction for it. Both are
+//! rounded correctly, as IEEE 754 asks, so that every machine gives the same bits. The only `unsafe` code of the map is here.
 #![no_std]
 #![deny(missing_docs)]
 
