@@ -1,0 +1,131 @@
+//! What several commands share.
+
+use std::io::IsTerminal;
+use std::path::Path;
+
+use anyhow::Context;
+use clap::ValueEnum;
+use comfy_table::{CellAlignment, Table, presets};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use lineslam::log::Log;
+use lineslam::output::report::Report;
+use lineslam::output::svg::Scene;
+use lineslam::output::{self, csv, grid, svg, tum};
+use lineslam::replay::{self, Replay, ReplayError};
+use lineslam::robot::Robot;
+use slam_core::SlamConfig;
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Configuration {
+    Default,
+    Paper,
+}
+
+impl Configuration {
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Default => "default",
+            Self::Paper => "paper",
+        }
+    }
+
+    /// For pictures.
+    pub fn subtitle(self) -> &'static str {
+        match self {
+            Self::Default => "default configuration",
+            Self::Paper => "paper configuration",
+        }
+    }
+
+    pub fn config(self) -> SlamConfig {
+        match self {
+            Self::Default => SlamConfig::default(),
+            Self::Paper => SlamConfig::paper(),
+        }
+    }
+}
+
+/// Writes a single file, whole or not at all.
+pub fn write_one(path: &Path, text: String) -> anyhow::Result<()> {
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let name = path.file_name().context("--out is not a file name")?;
+    Ok(output::write_all(folder, &[(name, text.into_bytes())])?)
+}
+
+pub fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Replay, ReplayError> {
+    let progress = progress_bar(log.scans.len(), "scans");
+    let result = replay::run(log, robot, configuration.config(), || progress.inc(1))?;
+    progress.finish_and_clear();
+    Ok(result)
+}
+
+/// The files that every run leaves behind.
+pub fn results(
+    result: &Replay,
+    report: &Report,
+    scene: &Scene<'_>,
+) -> anyhow::Result<Vec<(&'static str, Vec<u8>)>> {
+    let grid = grid::render(result).context("map.pgm")?;
+    Ok(vec![
+        ("trajectory.tum", tum::render(replay::trajectory(&result.steps)).into_bytes()),
+        ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),
+        ("map.csv", csv::render(&result.map).context("map.csv")?),
+        ("map.svg", svg::render(&result.into(), scene).into_bytes()),
+        ("map.pgm", grid.pgm),
+        ("map.yaml", grid.yaml.into_bytes()),
+        ("report.json", report.render().context("report.json")?),
+    ])
+}
+
+/// A bar on a terminal, nothing in a pipe.
+pub fn progress_bar(steps: usize, what: &'static str) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:40.cyan/dim} {pos}/{len} {msg}  {per_sec}  {eta} left")
+        .expect("the template is a constant");
+    let target = if std::io::stderr().is_terminal() {
+        ProgressDrawTarget::stderr()
+    } else {
+        ProgressDrawTarget::hidden()
+    };
+    ProgressBar::with_draw_target(Some(steps as u64), target).with_style(style).with_message(what)
+}
+
+pub fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    let skipped = match report.records_skipped.values().sum::<usize>() {
+        0 => "none".to_owned(),
+        _ => report
+            .records_skipped
+            .iter()
+            .map(|(reason, n)| format!("{n} {reason}"))
+            .collect::<Vec<_>>()
+            .join(", "),
+    };
+    let mut rows = vec![
+        (source, format!("{name} ({})", report.format)),
+        ("robot, configuration", format!("{}, {}", report.robot, report.configuration)),
+        ("scans used", report.scans_used.to_string()),
+        ("records skipped", skipped),
+        ("driven", format!("{:.1} m in {:.1} s", report.distance_m, report.duration_s)),
+        ("map", format!("{} segments, room for {}", report.segments, report.map_capacity)),
+        (
+            "time for a scan, here",
+            format!(
+                "median {:.0} µs, p99 {:.0} µs, max {:.0} µs",
+                report.scan_us.median, report.scan_us.p99, report.scan_us.max
+            ),
+        ),
+        ("RAM of Slam", format!("{} bytes", report.slam_bytes)),
+    ];
+    if let Some(simulation) = &report.simulation {
+        rows.extend(simulation.rows());
+    }
+    rows.push(("written to", out.display().to_string()));
+    for (what, value) in rows {
+        table.add_row([what.to_owned(), value]);
+    }
+    if let Some(column) = table.column_mut(0) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    println!("{table}");
+}

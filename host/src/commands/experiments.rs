@@ -1,0 +1,56 @@
+//! `lineslam experiments`.
+
+use std::path::{Path, PathBuf};
+
+use lineslam::experiments::{self, document};
+use lineslam::output;
+
+use super::common::progress_bar;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Drives of each building.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    seeds: u32,
+    /// Seed of the first drive; the others follow.
+    #[arg(long, default_value_t = 1001)]
+    first_seed: u64,
+    /// Folder of the worlds hall, corridor, office and parallel.
+    #[arg(long, value_name = "FOLDER", default_value = "worlds")]
+    worlds: PathBuf,
+    /// Folder of recorded logs with their references; without it that part is left out.
+    #[arg(long, value_name = "FOLDER", env = "LINESLAM_DATA")]
+    data: Option<PathBuf>,
+    /// Folder for experiments.md and images/.
+    #[arg(long, value_name = "FOLDER", default_value = "docs")]
+    out: PathBuf,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let seeds = args.first_seed..args.first_seed.saturating_add(u64::from(args.seeds));
+    let options = experiments::Options { worlds: args.worlds.clone(), data: args.data.clone(), seeds };
+    let progress = progress_bar(experiments::steps(&options), "drives");
+    let results = experiments::run(&options, || progress.inc(1))?;
+    progress.finish_and_clear();
+    let with_data = if results.recorded.is_empty() { "" } else { " --data LOGS" };
+    let command = format!(
+        "cargo run --release -p lineslam -- experiments --seeds {} --first-seed {}{with_data}",
+        args.seeds, args.first_seed
+    );
+    let page = document::render(&results, &command, "images");
+    let mut files: Vec<(PathBuf, Vec<u8>)> = vec![("experiments.md".into(), page.into_bytes())];
+    files.extend(
+        results
+            .figures
+            .iter()
+            .map(|(name, text)| (Path::new("images").join(name), text.clone().into_bytes())),
+    );
+    output::write_all(&args.out, &files)?;
+    println!("{}\n\n{}", document::buildings(&results), document::robustness(&results));
+    println!("\n{}\n\n{}", document::honesty(&results), document::featureless(&results));
+    if !results.recorded.is_empty() {
+        println!("\n{}\n\n{}", document::recorded(&results.recorded), document::walls(&results.recorded));
+    }
+    println!("\nwritten to {}", args.out.join("experiments.md").display());
+    Ok(())
+}

@@ -1,0 +1,63 @@
+//! `lineslam simulate`.
+
+use std::path::PathBuf;
+
+use lineslam::output::report::{Report, SimulationReport};
+use lineslam::output::svg::Scene;
+use lineslam::output::{self, tum};
+use lineslam::robot::Robot;
+use lineslam::sim::world::World;
+use lineslam::sim::{self, SimConfig, judge};
+
+use super::common::{Configuration, print_summary, results};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// World file: walls, things, people, and the robot's path.
+    world: PathBuf,
+    /// Seed of all noise; the same seed gives the same drive.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Robot file. By default paper.toml.
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Which algorithm: the best we know, or the paper step for step.
+    #[arg(long, value_enum, default_value_t = Configuration::Default)]
+    config: Configuration,
+    /// Folder for all that replay writes, and for log.dat, which replay reads, and truth.tum.
+    #[arg(long, value_name = "FOLDER", default_value = "out")]
+    out: PathBuf,
+    /// Change an error of the simulated robot: wheel.radius_error, wheel.radius_difference, wheel.track_error,
+    /// wheel.slip_m_per_sqrt_m, sensor.sigma_m, sensor.sigma_per_m, sensor.uniform_m, sensor.dropout,
+    /// sensor.mixed_pixels, sensor.least_incidence, sensor.skip_every, sensor.delay_s.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let world = World::load(&args.world)?;
+    let robot = args.robot.as_deref().map_or_else(|| Ok(Robot::usual_for("simulated")), Robot::load)?;
+    let mut errors = SimConfig::default();
+    for setting in &args.settings {
+        errors.set(setting)?;
+    }
+    let drive = sim::drive(&world, &robot, &errors, args.seed)?;
+    let result = super::common::run(&drive.log, &robot, args.config)?;
+    let mut report = Report::new(&drive.log, &robot, args.config.name(), &result);
+    report.simulation = Some(SimulationReport::new(&world, &drive, &result, args.seed, errors));
+    let caption = format!("{}, seed {}", world.name, args.seed);
+    let blueprint = judge::blueprint_in_map(&world, &drive);
+    let scene = Scene {
+        title: &caption,
+        subtitle: args.config.subtitle(),
+        blueprint: &blueprint,
+        ..Scene::default()
+    };
+    let mut files = results(&result, &report, &scene)?;
+    files.push(("log.dat", sim::mines_text(&drive.log).into_bytes()));
+    let stamps = drive.log.scans.iter().map(|s| s.stamp_us);
+    files.push(("truth.tum", tum::render_f64(stamps.zip(&drive.truth)).into_bytes()));
+    output::write_all(&args.out, &files)?;
+    print_summary("world", &caption, &args.out, &report);
+    Ok(())
+}
