@@ -36,7 +36,7 @@ struct Cli {
     /// Length of the run, seconds of virtual time. By default it ends when the path does.
     #[arg(long, value_name = "N")]
     seconds: Option<u64>,
-    /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.dat, log.txt, console.tum and report.json.
+    /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.jsonl, log.txt, console.tum and report.json.
     #[arg(long, value_name = "FOLDER", default_value = "out")]
     out: PathBuf,
     /// What goes wrong: unplug@S+S, garble=N, line=N, streaming=BIT/S, reset@S, stamp-wrap. May be given again.
@@ -144,7 +144,7 @@ fn files(
         ("truth.tum", tum::render_f64(stamps().zip(&judged.drive.truth)).into_bytes()),
         ("map.csv", csv::render(&judged.map).context("map.csv")?),
         ("map.svg", svg::render(&picture, &scene).into_bytes()),
-        ("log.dat", report::log_text(judged).into_bytes()),
+        ("log.jsonl", report::log_text(judged, robot).into_bytes()),
         ("log.txt", log.into_bytes()),
         ("console.tum", outcome.console.clone().into_bytes()),
         ("report.json", report),

@@ -1,10 +1,10 @@
 //! What a run is judged by, and the files it leaves.
 
-use lineslam::log::{Log, LoggedScan, Odometry};
+use lineslam::log::{Log, LoggedScan, Odometry, plain_text};
 use lineslam::robot::Robot;
+use lineslam::sim::Drive;
 use lineslam::sim::judge::{self, TrajectoryErrors};
 use lineslam::sim::world::World;
-use lineslam::sim::{Drive, mines_text};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
 use slam_core::odometry::Integration;
@@ -79,7 +79,7 @@ pub struct Judged {
 pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judged> {
     let map = printed_map(outcome)?;
     let mut drive = Drive {
-        log: Log { format: "mines", ..Log::default() },
+        log: Log { format: "emulated", ..Log::default() },
         truth: Vec::new(),
         true_wheels: ([0.0; 2], 0.0),
     };
@@ -99,7 +99,12 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
         let counters = [ticks.left, ticks.right].map(|t| i64::from(t as u16));
         drive.log.odometry.push((truth.middle_us, Odometry::Ticks(counters)));
         let ranges_mm = ranges_mm.clone();
-        drive.log.scans.push(LoggedScan { line: number + 1, stamp_us: truth.middle_us, ranges_mm });
+        drive.log.scans.push(LoggedScan {
+            line: number + 1,
+            stamp_us: truth.middle_us,
+            ranges_mm,
+            geometry: None,
+        });
         drive.truth.push(truth.world_from_base);
         poses.push(entry.map_from_base());
         took.push(*took_us);
@@ -177,9 +182,9 @@ fn printed_map(outcome: &Outcome) -> anyhow::Result<Vec<MapSegment>> {
     Ok(map)
 }
 
-/// The log in the mines format, which `lineslam replay` reads.
-pub fn log_text(judged: &Judged) -> String {
-    mines_text(&judged.drive.log)
+/// The log in the plain format, which `lineslam replay` reads.
+pub fn log_text(judged: &Judged, robot: &Robot) -> String {
+    plain_text(&judged.drive.log, robot)
 }
 
 /// Points of all scans in `map`, for the drawing.

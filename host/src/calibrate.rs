@@ -86,7 +86,7 @@ pub enum CalibrationError {
     #[error(transparent)]
     Replay(#[from] ReplayError),
     /// No ticks.
-    #[error("the log brings poses, not wheel ticks: there is nothing to calibrate")]
+    #[error("the log brings poses, not wheel ticks or angles: there is nothing to calibrate")]
     NoTicks,
     /// Hardly any window in which the scanner's motion is known.
     #[error(
@@ -223,10 +223,15 @@ impl WheelTurns {
         let mut last: Option<[i64; 2]> = None;
         let mut samples = Vec::with_capacity(log.odometry.len());
         for (stamp_us, odometry) in &log.odometry {
-            let Odometry::Ticks(ticks) = odometry else { return None };
-            let before = last.replace(*ticks).unwrap_or(*ticks);
-            for (turn, moved) in turns.iter_mut().zip(wheels.ticks_between(before, *ticks)) {
-                *turn += f64::from(moved) * per_tick;
+            match odometry {
+                Odometry::Ticks(ticks) => {
+                    let before = last.replace(*ticks).unwrap_or(*ticks);
+                    for (turn, moved) in turns.iter_mut().zip(wheels.ticks_between(before, *ticks)) {
+                        *turn += f64::from(moved) * per_tick;
+                    }
+                }
+                Odometry::Angles(angles) => turns = *angles,
+                Odometry::Pose(_) => return None,
             }
             samples.push((*stamp_us as f64 * 1e-6, turns));
         }

@@ -2,6 +2,8 @@
 #![forbid(unsafe_code)]
 #![deny(missing_docs)]
 
+pub mod beams;
+pub mod benchmark;
 pub mod calibrate;
 pub mod experiments;
 pub mod log;

@@ -6,11 +6,13 @@ mod commands;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use commands::{calibrate, experiments, replay, scan, simulate};
+use commands::{benchmark, calibrate, experiments, replay, scan, score, simulate};
+use lineslam::benchmark::BenchmarkError;
 use lineslam::calibrate::CalibrationError;
 use lineslam::experiments::ExperimentError;
 use lineslam::log::LogError;
 use lineslam::replay::ReplayError;
+use lineslam::score::ScoreError;
 use lineslam::sim::BadSetting;
 use lineslam::toml_file::FileError;
 
@@ -28,6 +30,10 @@ enum Command {
     Replay(replay::Args),
     /// Drive a simulated robot through a world and see how well it maps it.
     Simulate(simulate::Args),
+    /// Judge a trajectory by a reference, or by relations between poses that were checked by hand.
+    Score(score::Args),
+    /// Replay all recorded logs of a folder, and write the page that compares the results with published ones.
+    Benchmark(benchmark::Args),
     /// Learn wheel radii, track, delay and mounting from a drive, and write a robot file.
     Calibrate(calibrate::Args),
     /// Run the paper's experiments and more, and write the page with tables and figures.
@@ -40,6 +46,8 @@ fn main() -> ExitCode {
     let done = match Cli::parse().command {
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::Score(args) => score::run(&args),
+        Command::Benchmark(args) => benchmark::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Experiments(args) => experiments::run(&args),
         Command::Scan(args) => scan::run(&args),
@@ -51,6 +59,8 @@ fn main() -> ExitCode {
             let bad_input = error.is::<LogError>()
                 || error.is::<FileError>()
                 || error.is::<ReplayError>()
+                || error.is::<ScoreError>()
+                || error.is::<BenchmarkError>()
                 || error.is::<BadSetting>()
                 || error.is::<CalibrationError>()
                 || error.is::<ExperimentError>();

@@ -106,10 +106,10 @@ fn command(log: &Path, robot: &Path, out: &Path) -> Output {
 #[test]
 fn the_command_writes_a_robot_file_and_keeps_its_comments() {
     let folder = tempfile::tempdir().unwrap();
-    let (log, out) = (folder.path().join("log.dat"), folder.path().join("new/robot.toml"));
+    let (log, out) = (folder.path().join("log.jsonl"), folder.path().join("new/robot.toml"));
     let world = World::load(&root().join("worlds/hall_quarter.toml")).unwrap();
     let drive = drive(&world, &Robot::usual_for("simulated"), &SimConfig::default(), 3).unwrap();
-    std::fs::write(&log, lineslam::sim::mines_text(&drive.log)).unwrap();
+    std::fs::write(&log, lineslam::log::plain_text(&drive.log, &Robot::usual_for("simulated"))).unwrap();
     let output = command(&log, &wrong_file(folder.path()), &out);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert!(String::from_utf8_lossy(&output.stdout).contains("wheels.track_m"));

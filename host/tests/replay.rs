@@ -60,6 +60,9 @@ impl Bench {
     }
 }
 
+/// A name, and what is done to the lines of a good log that is still one.
+type Twist = (&'static str, fn(&mut Vec<String>));
+
 /// A name, what is done to the lines of a good log, and what must be said of it.
 type Spoilt = (&'static str, fn(&mut Vec<String>), &'static [&'static str]);
 
@@ -125,8 +128,18 @@ fn writes_every_file_for_a_carmen_log() {
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
     names.sort();
-    let expected =
-        ["map.csv", "map.pgm", "map.svg", "map.yaml", "odometry.tum", "report.json", "trajectory.tum"];
+    let expected = [
+        "map.csv",
+        "map.dxf",
+        "map.pgm",
+        "map.svg",
+        "map.yaml",
+        "odometry.tum",
+        "report.json",
+        "trajectory.csv",
+        "trajectory.tum",
+        "trajectory_final.tum",
+    ];
     assert_eq!(names, expected);
 
     let trajectory = bench.lines("trajectory.tum");
@@ -165,6 +178,7 @@ fn grid_is_what_map_server_reads() {
     let (width, height): (usize, usize) = (header[1].parse().unwrap(), header[2].parse().unwrap());
     let pixels = &pgm[pgm.len() - width * height..];
     let yaml = std::fs::read_to_string(bench.out().join("map.yaml")).unwrap();
+    assert!(yaml.contains("\nmode: trinary\n"), "{yaml}");
     let origin: Vec<f64> = yaml
         .lines()
         .find_map(|l| l.strip_prefix("origin: "))
@@ -232,6 +246,154 @@ fn robot_laser_records_bring_their_own_geometry() {
     assert!(ahead, "the wall 5 m ahead of the axle is there: {map:?}");
 }
 
+/// A scanner that looks all round and does not turn evenly, as cheap ones do: each scan has its own number of beams.
+#[test]
+fn each_scan_may_have_beams_of_its_own() {
+    let line = |k: usize| {
+        let (x, beams) = (0.05 * k as f64, 340 + 7 * (k % 5));
+        let step = 360.0 / beams as f64;
+        let bearing = |i: usize| (-180.0 + step * i as f64).to_radians();
+        let ranges: Vec<String> = (0..beams).map(|i| format!("{:.3}", room(x, bearing(i)))).collect();
+        format!(
+            "{{\"t_us\":{},\"pose\":[{x},0,0],\"sensor\":{{\"first_bearing_deg\":-180,\"step_deg\":{step},\
+             \"max_range_m\":12}},\"ranges_m\":[{}]}}",
+            100_000 * (k + 1),
+            ranges.join(",")
+        )
+    };
+    let text: Vec<String> =
+        std::iter::once("{\"lineslam_log\":1}".to_owned()).chain((0..40).map(line)).collect();
+    let bench = Bench::new();
+    let output = bench.replay(&bench.file("round.jsonl", text.join("\n")), &[]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(bench.report()["scans_used"], 40);
+    assert_eq!(bench.report()["warnings"][0]["suspected"], "beam_counts_vary");
+    let last: Vec<f64> = bench.lines("trajectory.tum")[39].split(' ').map(|w| w.parse().unwrap()).collect();
+    assert!((last[1] - 1.95).abs() < 0.01 && last[2].abs() < 0.01, "{last:?}");
+    // Each wall is there, and nothing else.
+    for wall in bench.lines("map.csv").iter().skip(1) {
+        let v: Vec<f64> = wall.split(',').map(|w| w.parse().unwrap()).collect();
+        let on = |axis: usize, at: f64| (v[axis] - at).abs() < 0.02 && (v[axis + 2] - at).abs() < 0.02;
+        assert!(on(0, 5.0) || on(0, -3.0) || on(1, 2.5) || on(1, -3.5), "{wall}");
+    }
+    assert!((4..=6).contains(&(bench.lines("map.csv").len() - 1)), "{:?}", bench.lines("map.csv"));
+}
+
+#[test]
+fn what_real_logs_are_like_does_not_stop_them() {
+    let plain = Bench::new();
+    assert!(plain.replay(&plain.file("room.log", carmen_log(12).join("\n")), &[]).status.success());
+    let expected = plain.lines("trajectory.tum");
+    let twists: [Twist; 6] = [
+        ("codes", |l| {
+            let mut words: Vec<String> = l[5].split(' ').map(str::to_owned).collect();
+            for (at, code) in [(20, "-1"), (40, "nan"), (60, "inf"), (80, "-inf"), (100, "0"), (120, "1e9")] {
+                words[at] = code.into();
+            }
+            l[5] = words.join(" ");
+        }),
+        ("far away", |l| {
+            // The odometry starts 500 km away.
+            for line in l.iter_mut().skip(2) {
+                let mut words: Vec<String> = line.split(' ').map(str::to_owned).collect();
+                for at in [183, 186] {
+                    words[at] = (words[at].parse::<f64>().unwrap() + 5e5).to_string();
+                }
+                *line = words.join(" ");
+            }
+        }),
+        ("jump", |l| l.insert(6, "ODOM 400 0 0 0 0 0 101.15 host 101.15".into())),
+        ("old", |l| l.insert(9, "ODOM 0 0 0 0 0 0 100.6 host 1".into())),
+        ("negative", |l| l.insert(9, "ODOM 0 0 0 0 0 0 -3 host 1".into())),
+        ("comment", |l| l.insert(4, "# \u{fc}".into())),
+    ];
+    for (name, twist) in twists {
+        let bench = Bench::new();
+        let mut lines = carmen_log(12);
+        twist(&mut lines);
+        let output = bench.replay(&bench.file("room.log", lines.join("\n")), &[]);
+        assert!(output.status.success(), "{name}: {output:?}");
+        let got = bench.lines("trajectory.tum");
+        assert_eq!(got.len(), expected.len(), "{name}");
+        for (got, expected) in got.iter().zip(&expected) {
+            let numbers = |line: &str| line.split(' ').map(|w| w.parse::<f64>().unwrap()).collect::<Vec<_>>();
+            let (got, expected) = (numbers(got), numbers(expected));
+            assert!(
+                (got[1] - expected[1]).hypot(got[2] - expected[2]) < 0.01,
+                "{name}: {got:?} {expected:?}"
+            );
+        }
+    }
+}
+
+/// A thousand readings of the odometry between two scans, on a way that is no straight line.
+#[test]
+fn no_motion_is_lost_between_scans_far_apart() {
+    let mut lines = carmen_log(3);
+    let at = |k: usize| {
+        // Out to the left and back to where the next scan is.
+        let share = k as f64 / 2000.0;
+        (0.2 + 0.1 * share, 3.0 * (share * std::f64::consts::PI).sin())
+    };
+    for k in 1..2000 {
+        let (x, y) = at(k);
+        let t = 100.9 + 0.03 * k as f64;
+        lines.push(format!("ODOM {x} {y} 0 0 0 0 {t} host {t}"));
+    }
+    let (x, y) = at(2000);
+    let scan = flaser(3)
+        .replace(" 0.30000000000000004 0 0 0.30000000000000004 0 0 ", &format!(" {x} {y} 0 {x} {y} 0 "));
+    lines.push(scan.replace("101.1 host 101.1", "160.9 host 160.9"));
+    let bench = Bench::new();
+    let output = bench.replay(&bench.file("gap.log", lines.join("\n")), &[]);
+    assert!(output.status.success(), "{output:?}");
+    let distance_m = bench.report()["distance_m"].as_f64().unwrap();
+    assert!((distance_m - 6.2).abs() < 0.05, "{distance_m}");
+    let end: Vec<f64> = bench.lines("odometry.tum")[3].split(' ').map(|w| w.parse().unwrap()).collect();
+    assert!((end[1] - x).abs() < 1e-3 && (end[2] - y).abs() < 1e-3, "{end:?}");
+}
+
+#[test]
+fn a_log_most_of_which_cannot_be_used_is_refused() {
+    let mut lines = carmen_log(12);
+    for line in &mut lines[3..11] {
+        line.truncate(300);
+    }
+    let bench = Bench::new();
+    let log = bench.file("spoilt.log", lines.join("\n"));
+    bench.refuses(&log, &["--lenient"], &["only 4 of 12 scans", "8 truncated"]);
+}
+
+#[test]
+fn the_scanner_of_a_log_with_several_is_chosen() {
+    let rear = |line: &str| {
+        // The scanner on the back sees the room the other way round.
+        let x: f64 = line.split(' ').nth(183).unwrap().parse().unwrap();
+        let ranges: Vec<String> =
+            (0..181).map(|i| format!("{:.2}", room(x - 0.2, f64::from(i + 90).to_radians()))).collect();
+        let tail: Vec<&str> = line.split(' ').skip(183).collect();
+        format!("RLASER 181 {} {}", ranges.join(" "), tail.join(" "))
+    };
+    let mut lines = vec!["PARAM robot_rearlaser_offset -0.2 nohost 0".to_owned()];
+    for k in 0..12 {
+        lines.extend([flaser(k), rear(&flaser(k))]);
+    }
+    let bench = Bench::new();
+    let log = bench.file("both.log", lines.join("\n"));
+    let output = bench.replay(&log, &[]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(bench.report()["warnings"][0]["suspected"], "several_scanners");
+    let output = bench.replay(&log, &["--scanner", "RLASER"]);
+    assert!(output.status.success(), "{output:?}");
+    let behind = bench.lines("map.csv").iter().skip(1).any(|l| {
+        let v: Vec<f64> = l.split(',').map(|w| w.parse().unwrap()).collect();
+        (v[0] + 3.0).abs() < 0.02 && (v[2] + 3.0).abs() < 0.02
+    });
+    assert!(behind, "the wall behind is there: {:?}", bench.lines("map.csv"));
+    std::fs::remove_dir_all(bench.out()).unwrap();
+    bench.refuses(&log, &["--scanner", "RAWLASER3"], &["no RAWLASER3"]);
+}
+
 #[test]
 fn both_configurations_run() {
     let bench = Bench::new();
@@ -252,23 +414,23 @@ fn bad_records_name_file_and_line() {
         ),
         (
             "beams",
-            |l| l[5] = l[5].replacen("FLASER 181 ", "FLASER 182 1.00 ", 1),
-            &["line 6", "182 beams instead of 181"],
+            |l| l[5] = "FLASER 3 1 1 1 0 0 0 0 0 0 101.1 host 101.1".into(),
+            &["line 6", "3 beams instead of 181"],
         ),
         ("backwards", |l| l.swap(5, 6), &["line 7", "time runs backwards", "101.100000", "101.300000"]),
+        ("nan", |l| l[5] = l[5].replace(" 101.1 host", " NaN host"), &["line 6", "time stamp", "NaN"]),
         (
-            "nan",
-            |l| l[5] = l[5].replacen(" 181 ", " 181 NaN ", 1).replacen(" 0 0 101", " 0 101", 1),
-            &["line 6", "NaN"],
+            "stamp",
+            |l| l[5] = l[5].replace(" 101.1 host", " -4 host"),
+            &["line 6", "time runs backwards", "-4"],
         ),
-        ("stamp", |l| l[5] = l[5].replace(" 101.1 host", " -4 host"), &["line 6", "time stamp", "-4"]),
     ];
     for (name, spoil, words) in cases {
         let bench = Bench::new();
         let mut lines = carmen_log(12);
         spoil(&mut lines);
         let log = bench.file(name, lines.join("\n"));
-        bench.refuses(&log, &[], &[words, &[name]].concat());
+        bench.refuses(&log, &[], &[words, &[name, "--lenient"]].concat());
     }
 }
 
@@ -304,13 +466,17 @@ fn files_that_are_no_log_are_named() {
         &[],
         &["note.txt", "line 1", "neither", "dear diary"],
     );
+    bench.refuses(&bench.file("bytes.log", [0xff, 0xfe, 0x00, 0x0a]), &[], &["bytes.log", "UTF-16"]);
+    bench.refuses(&bench.folder.path().join("absent.log"), &[], &["absent.log: No such file"]);
+    bench.refuses(bench.folder.path(), &[], &["is a directory"]);
+    bench.refuses(&bench.file("a.log", b"\x28\xb5\x2f\xfd\0\0"), &[], &["a.log", "zstd -d"]);
+    bench.refuses(&bench.file("b.log", b"a\0b\n"), &[], &["b.log", "binary"]);
+    let numbers = vec!["1"; 363].join(" ");
     bench.refuses(
-        &bench.file("bytes.log", [0xff, 0xfe, 0x00, 0x0a]),
+        &bench.file("c.log", numbers),
         &[],
-        &["bytes.log", "line 1", "not text"],
+        &["c.log", "line 1", "363 numbers", "707", "FLASER", "docs/logs.md"],
     );
-    bench.refuses(&bench.folder.path().join("absent.log"), &[], &["absent.log", "No such file"]);
-    bench.refuses(bench.folder.path(), &[], &["Is a directory"]);
     let mut cut = gzip(&carmen_log(400).join("\n"));
     cut.truncate(cut.len() / 2);
     bench.refuses(&bench.file("cut.log.gz", cut), &[], &["cut.log.gz", "line "]);
@@ -412,4 +578,95 @@ fn a_wrong_command_line_is_explained() {
         .unwrap();
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("best"));
+}
+
+/// Drivers of scanners that look all round close the turn: as many beams as degrees, and one more.
+#[test]
+fn a_closed_turn_is_a_scan_and_more_than_that_is_not() {
+    let text = |beams: usize| {
+        let line = |k: usize| {
+            let x = 0.05 * k as f64;
+            let bearing = |i: usize| (i as f64 - 180.0).to_radians();
+            let ranges: Vec<String> = (0..beams).map(|i| format!("{:.3}", room(x, bearing(i)))).collect();
+            format!(
+                "{{\"t_us\":{},\"pose\":[{x},0,0],\"ranges_m\":[{}]}}",
+                100_000 * (k + 1),
+                ranges.join(",")
+            )
+        };
+        let head =
+            "{\"lineslam_log\":1,\"sensor\":{\"first_bearing_deg\":-180,\"step_deg\":1,\"max_range_m\":12}}";
+        let lines: Vec<String> = std::iter::once(head.to_owned()).chain((0..10).map(line)).collect();
+        lines.join("\n")
+    };
+    let bench = Bench::new();
+    let output = bench.replay(&bench.file("closed.jsonl", text(361)), &[]);
+    assert!(output.status.success(), "{output:?}");
+    std::fs::remove_dir_all(bench.out()).unwrap();
+    bench.refuses(
+        &bench.file("twice.jsonl", text(400)),
+        &[],
+        &["twice.jsonl", "line 2", "400 beams", "1.11 times"],
+    );
+}
+
+#[test]
+fn clocks_that_have_nothing_to_do_with_each_other_are_said() {
+    let mut lines: Vec<String> = carmen_log(12).iter().map(|l| l.replace("FLASER", "RAWLASER1")).collect();
+    for (k, line) in lines.iter_mut().enumerate().skip(2) {
+        // The scanner's clock began when it was switched on.
+        let words: Vec<&str> = line.split(' ').collect();
+        *line = format!(
+            "RAWLASER1 0 -1.570796 3.141593 0.0174533 80 0.01 0 181 {} 0 {} host 0",
+            words[2..183].join(" "),
+            0.2 * k as f64
+        );
+        let odometry = format!("ODOM {} 0 0 0 0 0 {} host 0", 0.1 * (k - 2) as f64, 5000.0 + 0.2 * k as f64);
+        line.push_str(&format!("\n{odometry}"));
+    }
+    let bench = Bench::new();
+    let output = bench.replay(&bench.file("clocks.log", lines.join("\n")), &[]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(bench.report()["warnings"][0]["suspected"], "odometry_of_another_time");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("5000.400"), "{output:?}");
+}
+
+/// One scan of many that comes too late, as when a network held it up, does not stop a log.
+#[test]
+fn few_scans_out_of_order_are_left_out_and_said() {
+    let mut lines = carmen_log(100);
+    lines.swap(50, 51);
+    let bench = Bench::new();
+    let output = bench.replay(&bench.file("late.log", lines.join("\n")), &[]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(bench.report()["scans_used"], 99);
+    assert_eq!(bench.report()["records_skipped"], serde_json::json!({ "time_not_increasing": 1 }));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("line 52: time runs backwards"), "{output:?}");
+}
+
+/// Ranges in centimetres, and a table of another program with semicolons and points.
+#[test]
+fn other_units_and_separators_are_understood_when_told() {
+    let bench = Bench::new();
+    let centimetres = |line: String| {
+        let words: Vec<String> = line
+            .split(' ')
+            .enumerate()
+            .map(|(at, w)| match w.parse::<f64>() {
+                Ok(v) if (2..183).contains(&at) => (v * 100.0).to_string(),
+                _ => w.to_owned(),
+            })
+            .collect();
+        words.join(" ")
+    };
+    let lines: Vec<String> = (0..12).map(flaser).map(centimetres).collect();
+    let log = bench.file("cm.log", lines.join("\n"));
+    bench.refuses(&log, &[], &["median range is", "centimetres", "--ranges cm"]);
+    assert!(bench.replay(&log, &["--ranges", "cm"]).status.success());
+    let last: Vec<f64> = bench.lines("trajectory.tum")[11].split(' ').map(|w| w.parse().unwrap()).collect();
+    assert!((last[1] - 1.1).abs() < 0.02, "{last:?}");
+    let table: Vec<String> = (0..12).map(mines_line).map(|line| line.replace(' ', ".0;")).collect();
+    let output = bench.replay(&bench.file("table.dat", table.join("\n")), &[]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(bench.report()["scans_used"], 12);
 }

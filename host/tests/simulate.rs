@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use lineslam::log::{self, Format, Odometry, ReadOptions};
+use lineslam::log::{self, Odometry, ReadOptions};
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
 use lineslam::sim::{SimConfig, drive};
@@ -59,7 +59,7 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
         let out = folder.path().join(name);
         let output = simulate(&out, &[world, "--seed", seed]);
         assert!(output.status.success(), "{output:?}");
-        (std::fs::read(out.join("log.dat")).unwrap(), std::fs::read(out.join("trajectory.tum")).unwrap())
+        (std::fs::read(out.join("log.jsonl")).unwrap(), std::fs::read(out.join("trajectory.tum")).unwrap())
     };
     assert_eq!(log("a", "5"), log("b", "5"));
     assert_ne!(log("a", "5").0, log("c", "6").0);
@@ -73,7 +73,7 @@ fn the_log_replays_to_the_same_trajectory() {
     assert!(simulate(&first, &[world.to_str().unwrap()]).status.success());
     let robot = Path::new(env!("CARGO_MANIFEST_DIR")).join("../robots/paper.toml");
     let output = Command::new(env!("CARGO_BIN_EXE_lineslam"))
-        .args(["replay".as_ref(), first.join("log.dat").as_os_str(), "--robot".as_ref(), robot.as_os_str()])
+        .args(["replay".as_ref(), first.join("log.jsonl").as_os_str(), "--robot".as_ref(), robot.as_os_str()])
         .arg("--out")
         .arg(&second)
         .output()
@@ -145,7 +145,7 @@ fn counters_wrap_scans_go_missing_and_ticks_lie_as_asked() {
         .iter()
         .map(|(_, o)| match o {
             Odometry::Ticks([left, _]) => *left,
-            Odometry::Pose(_) => unreachable!("the simulated robot counts ticks"),
+            Odometry::Angles(_) | Odometry::Pose(_) => unreachable!("the simulated robot counts ticks"),
         })
         .collect();
     assert!(ticks.iter().all(|t| (0..65_536).contains(t)));
@@ -197,13 +197,34 @@ fn range_noise_is_the_model_s() {
 }
 
 #[test]
-fn a_written_log_is_a_mines_log() {
+fn a_written_log_is_read_as_it_was() {
     let drive = drive(&world("parallel.toml"), &robot(), &SimConfig::default(), 2).unwrap();
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("log.dat");
-    std::fs::write(&path, lineslam::sim::mines_text(&drive.log)).unwrap();
-    let options = ReadOptions { format: Format::Auto, beams: robot().beams(), lenient: false };
+    let path = folder.path().join("log.jsonl");
+    std::fs::write(&path, log::plain_text(&drive.log, &robot())).unwrap();
+    let options = ReadOptions { beams: robot().beams(), ..ReadOptions::default() };
     let read = log::read(&path, &options).unwrap();
+    assert_eq!(read.format, "plain");
     assert_eq!(read.odometry, drive.log.odometry);
-    assert_eq!(read.scans, drive.log.scans);
+    assert_eq!(read.scans.len(), drive.log.scans.len());
+    for (read, written) in read.scans.iter().zip(&drive.log.scans) {
+        assert_eq!((read.stamp_us, &read.ranges_mm), (written.stamp_us, &written.ranges_mm));
+    }
+    // What the first line says of the robot is what the robot file says.
+    let (stated, known) = (read.usual_robot(), robot());
+    assert_eq!(stated.drive(), known.drive());
+    let [stated, known] = [&stated, &known].map(|robot| robot.sensor_for(&read.layout(0)));
+    for beam in [0, 100, 681] {
+        let bearing = |sensor: &slam_core::scan::SensorConfig| {
+            slam_core::pose::heading(&sensor.mounting.base_from_laser) + sensor.geometry.bearing(beam)
+        };
+        assert!(
+            (bearing(&stated) - bearing(&known)).abs() < 1e-5,
+            "{} {}",
+            bearing(&stated),
+            bearing(&known)
+        );
+    }
+    assert_eq!((stated.codes.min_mm, stated.codes.max_mm), (known.codes.min_mm, known.codes.max_mm));
+    assert!((i64::from(stated.geometry.revolution_us) - i64::from(known.geometry.revolution_us)).abs() <= 1);
 }

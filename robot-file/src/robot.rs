@@ -4,11 +4,11 @@
 
 use std::path::Path;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use slam_core::SlamConfig;
 use slam_core::odometry::{DifferentialDrive, OdometryNoise, ticks_between_u16, ticks_between_u32};
 use slam_core::pose::pose;
-use slam_core::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry};
+use slam_core::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
 
 use crate::toml_file::{self, Checked, FileError, Impossible, finite, not_negative, positive};
 
@@ -26,10 +26,13 @@ pub struct Robot {
     pub sensor: Sensor,
     /// Where the scanner sits.
     pub mounting: MountingFile,
+    /// Whether nobody described this robot: what a log states goes before it.
+    #[serde(skip)]
+    pub usual: bool,
 }
 
 /// `[wheels]`
-#[derive(Clone, Copy, Debug, Deserialize)]
+#[derive(Clone, Copy, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Wheels {
     /// Radius of the left wheel, metres.
@@ -131,15 +134,39 @@ pub struct MountingFile {
     upside_down: bool,
 }
 
-/// Beams and mounting that a log states itself; they overrule the robot file.
+/// Beams, limits and mounting that a log states itself. They stand in for what no robot file says.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StatedGeometry {
-    /// Bearing of the first beam, radians.
+    /// Bearing of the first beam in `laser`, radians.
     pub first_bearing_rad: f32,
-    /// Angle between beams, radians.
+    /// Angle from beam to beam, radians; negative where the beams run clockwise.
     pub step_rad: f32,
-    /// Pose of the scanner on the robot.
-    pub base_from_laser: [f32; 3],
+    /// Time of a whole revolution, seconds; zero where all beams may be taken as simultaneous.
+    pub revolution_s: f32,
+    /// Least and greatest distance, metres; what is at the greatest or beyond met nothing.
+    pub limits_m: Option<[f32; 2]>,
+    /// Pose of the scanner on the robot (x, y, yaw), metres and radians.
+    pub base_from_laser: Option<[f32; 3]>,
+    /// Whether the scanner hangs head down.
+    pub upside_down: bool,
+}
+
+/// How the beams of one scan lie, as far as a log tells.
+#[derive(Clone, Copy, Debug)]
+pub struct ScanLayout<'a> {
+    /// Ranges of this scan.
+    pub beams: usize,
+    /// Ranges of most scans of the log, over which a robot file's field of view is spread.
+    pub commonest: usize,
+    /// What the log states.
+    pub stated: Option<&'a StatedGeometry>,
+}
+
+impl ScanLayout<'_> {
+    /// A scan of a log in which all are alike and nothing is stated.
+    pub fn plain(beams: usize) -> Self {
+        Self { beams, commonest: beams, stated: None }
+    }
 }
 
 impl Checked for Robot {
@@ -185,7 +212,8 @@ impl Robot {
             "simulated" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
             _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
         };
-        toml_file::parse(text, Path::new(name)).expect("the built-in robots are tested")
+        let robot: Self = toml_file::parse(text, Path::new(name)).expect("the built-in robots are tested");
+        Self { usual: true, ..robot }
     }
 
     fn check_sensor(&self) -> Result<(), Impossible> {
@@ -242,12 +270,13 @@ impl Robot {
     /// The default configuration on this robot; a URG's beams where the file does not state them.
     pub fn config(&self) -> SlamConfig {
         let mut config = SlamConfig::default();
-        self.apply(&mut config, self.beams().unwrap_or(ScanGeometry::URG_04LX.beams()), None);
+        let beams = self.beams().unwrap_or(ScanGeometry::URG_04LX.beams());
+        self.apply(&mut config, &ScanLayout::plain(beams));
         config
     }
 
-    /// Puts this robot into a configuration. `beams` and `stated` are the log's.
-    pub fn apply(&self, config: &mut SlamConfig, beams: usize, stated: Option<&StatedGeometry>) {
+    /// Puts this robot into a configuration, for scans of this layout.
+    pub fn apply(&self, config: &mut SlamConfig, layout: &ScanLayout<'_>) {
         let n = &self.odometry_noise;
         config.odometry.noise = OdometryNoise {
             sigma_along_m_per_sqrt_m: n.along_m_per_sqrt_m,
@@ -257,50 +286,74 @@ impl Robot {
             sigma_position_floor_m: n.position_floor_m,
             sigma_heading_floor_rad: n.heading_floor_deg.to_radians(),
         };
-        let s = &self.sensor;
-        let saturated = |mm: u32| mm.min(u32::from(u16::MAX)) as u16;
-        let mut no_echo_mm = [(1, 0); 2];
-        for (code, [from, to]) in no_echo_mm.iter_mut().zip(&s.no_echo_mm) {
-            *code = (saturated(*from), saturated(*to));
+        config.line_noise.sigma_offset_m = self.sensor.line_sigma_m;
+        config.sensor = self.sensor_for(layout);
+    }
+
+    /// The scanner, for scans of this layout.
+    pub fn sensor_for(&self, layout: &ScanLayout<'_>) -> SensorConfig {
+        let (s, m) = (&self.sensor, &self.mounting);
+        // A robot file that somebody gave knows better, but for scans that it does not fit.
+        let fits = !self.usual && self.beams().is_none_or(|beams| beams == layout.beams);
+        let stated = layout.stated.filter(|_| !fits);
+        let mut codes = s.codes();
+        if let Some([least, most]) = stated.and_then(|stated| stated.limits_m) {
+            codes.limit(least, most);
         }
-        config.sensor.codes =
-            RangeCodes { min_mm: saturated(s.min_range_mm), max_mm: saturated(s.max_range_mm), no_echo_mm };
-        config.line_noise.sigma_offset_m = s.line_sigma_m;
-        config.sensor.noise = RangeNoise {
-            sigma_m: s.sigma_m,
-            sigma_per_m: s.sigma_per_m,
-            sigma_bearing_rad: s.sigma_bearing_deg.to_radians(),
+        let (mut base_from_laser, upside_down) = match stated.and_then(|s| Some((s.base_from_laser?, s))) {
+            Some(([x, y, yaw], stated)) => (pose(x, y, yaw), stated.upside_down),
+            None => (pose(m.x_m, m.y_m, m.yaw_deg.to_radians()), m.upside_down),
         };
-        let m = &self.mounting;
-        let mut base_from_laser = pose(m.x_m, m.y_m, m.yaw_deg.to_radians());
-        let last = beams.saturating_sub(1) as u16;
-        (config.sensor.geometry, config.sensor.used_steps) = match (&s.steps, &s.field) {
-            (Some(steps), _) => (steps.geometry(), (steps.used[0], steps.used[1])),
-            (None, field) => {
-                let of_view_rad = field.as_ref().map_or(180.0, |f| f.of_view_deg).to_radians();
-                // 180 and 360 beams leave out the last edge, 181 and 361 have it.
-                let step_rad = of_view_rad / (beams - beams % 2).max(1) as f32;
-                let (step_rad, first_rad) = match stated {
-                    Some(stated) => (stated.step_rad, stated.first_bearing_rad),
-                    None => (step_rad, -0.5 * of_view_rad),
-                };
-                if let Some(stated) = stated {
-                    let [x, y, yaw] = stated.base_from_laser;
-                    base_from_laser = pose(x, y, yaw);
-                }
-                // Steps count from the first beam; what is left of its bearing is yaw.
-                let geometry = ScanGeometry {
-                    first_step: 0,
-                    last_step: last,
-                    front_step: 0,
-                    steps_per_revolution: 2.0 * std::f32::consts::PI / step_rad,
-                    revolution_us: 0,
-                };
-                base_from_laser *= pose(0.0, 0.0, if m.upside_down { -first_rad } else { first_rad });
-                (geometry, (0, last))
+        let mut clockwise = false;
+        // Steps count from the first beam; what is left of its bearing is yaw.
+        let mut from_first = |first_rad: f32, step_rad: f32, revolution_s: f32| {
+            base_from_laser *= pose(0.0, 0.0, if upside_down { -first_rad } else { first_rad });
+            clockwise = step_rad < 0.0;
+            ScanGeometry {
+                first_step: 0,
+                last_step: layout.beams.saturating_sub(1) as u16,
+                front_step: 0,
+                steps_per_revolution: 2.0 * std::f32::consts::PI / step_rad.abs(),
+                revolution_us: (revolution_s * 1e6).round() as u32,
             }
         };
-        config.sensor.mounting = Mounting { base_from_laser, upside_down: m.upside_down };
+        let geometry = match (&s.steps, stated) {
+            (_, Some(stated)) => from_first(stated.first_bearing_rad, stated.step_rad, stated.revolution_s),
+            (Some(steps), None) => steps.geometry(),
+            (None, None) => {
+                let of_view_rad = s.field.as_ref().map_or(180.0, |f| f.of_view_deg).to_radians();
+                // 180 and 360 beams leave out the last edge, 181 and 361 have it.
+                let step_rad = of_view_rad / (layout.commonest - layout.commonest % 2).max(1) as f32;
+                from_first(-0.5 * of_view_rad, step_rad, 0.0)
+            }
+        };
+        let used_steps = match (&s.steps, stated) {
+            (Some(steps), None) => (steps.used[0], steps.used[1]),
+            _ => (geometry.first_step, geometry.last_step),
+        };
+        SensorConfig {
+            geometry,
+            used_steps,
+            codes,
+            noise: RangeNoise {
+                sigma_m: s.sigma_m,
+                sigma_per_m: s.sigma_per_m,
+                sigma_bearing_rad: s.sigma_bearing_deg.to_radians(),
+            },
+            // Beams that run clockwise are those of a scanner that hangs head down.
+            mounting: Mounting { base_from_laser, upside_down: upside_down ^ clockwise },
+        }
+    }
+}
+
+impl Sensor {
+    fn codes(&self) -> RangeCodes {
+        let saturated = |mm: u32| mm.min(u32::from(u16::MAX)) as u16;
+        let mut no_echo_mm = [(1, 0); 2];
+        for (code, [from, to]) in no_echo_mm.iter_mut().zip(&self.no_echo_mm) {
+            *code = (saturated(*from), saturated(*to));
+        }
+        RangeCodes { min_mm: saturated(self.min_range_mm), max_mm: saturated(self.max_range_mm), no_echo_mm }
     }
 }
 

@@ -54,6 +54,9 @@ pub struct SlamConfig {
     pub registration: RegistrationConfig,
 }
 
+/// A scan's beams go round no farther than this, in turns.
+pub const MOST_OF_A_TURN: f32 = 1.02;
+
 /// URG-04LX 0.140 m ahead of the axle: the robot of the paper.
 const PAPER_SENSOR: SensorConfig = SensorConfig {
     geometry: ScanGeometry::URG_04LX,
@@ -197,8 +200,12 @@ impl SlamConfig {
             "sensor.geometry.steps_per_revolution",
             g.steps_per_revolution >= 1.0 && g.steps_per_revolution.is_finite(),
         )?;
-        // Beyond a full turn the same bearing would come twice.
-        check("sensor.geometry.steps_per_revolution", (g.beams() - 1) as f32 <= g.steps_per_revolution)?;
+        // Beyond a full turn the same bearings would come twice; where scanners that look all round close it they may, and the
+        // step be rounded.
+        check(
+            "sensor.geometry.steps_per_revolution",
+            (g.beams() - 1) as f32 <= MOST_OF_A_TURN * g.steps_per_revolution,
+        )?;
         check("sensor.used_steps", s.used_steps.0 <= s.used_steps.1)?;
         check("sensor.codes.max_mm", s.codes.max_mm > s.codes.min_mm)?;
         positive("sensor.noise.sigma_m", s.noise.sigma_m)?;

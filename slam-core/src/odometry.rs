@@ -52,9 +52,19 @@ pub struct DifferentialDrive {
 impl DifferentialDrive {
     /// The motion that a difference of both counters means; positive ticks drive forward.
     pub fn increment(&self, left_ticks: i32, right_ticks: i32, integration: Integration) -> Increment {
+        self.increment_of_parts(left_ticks as f32, right_ticks as f32, integration)
+    }
+
+    /// The same where ticks come in parts, as from the angles of wheels.
+    pub fn increment_of_parts(
+        &self,
+        left_ticks: f32,
+        right_ticks: f32,
+        integration: Integration,
+    ) -> Increment {
         let metres_per_tick_and_radius = 2.0 * core::f32::consts::PI / self.ticks_per_turn;
-        let left_m = left_ticks as f32 * metres_per_tick_and_radius * self.left_wheel_radius_m;
-        let right_m = right_ticks as f32 * metres_per_tick_and_radius * self.right_wheel_radius_m;
+        let left_m = left_ticks * metres_per_tick_and_radius * self.left_wheel_radius_m;
+        let right_m = right_ticks * metres_per_tick_and_radius * self.right_wheel_radius_m;
         let (distance_m, turn_rad) = (0.5 * (left_m + right_m), (right_m - left_m) / self.track_m);
         let before_from_after = match integration {
             Integration::Euler => pose::pose(distance_m, 0.0, turn_rad),

@@ -82,6 +82,14 @@ impl RangeCodes {
         self.min_mm..=self.max_mm
     }
 
+    /// Takes a scanner's own limits, metres: what is at the greatest or beyond met nothing, whatever else was a code for that.
+    pub fn limit(&mut self, least_m: f32, most_m: f32) {
+        // Casts saturate.
+        self.min_mm = ((least_m * 1e3 + 0.5) as u16).max(2);
+        self.max_mm = ((most_m * 1e3 + 0.5) as u16).saturating_sub(1).max(self.min_mm.saturating_add(1));
+        self.no_echo_mm = [(1, 0); 2];
+    }
+
     /// What one value of a scan means.
     pub fn read(&self, value_mm: u16) -> Reading {
         let no_echo = self.no_echo_mm.iter().any(|&(from, to)| (from..=to).contains(&value_mm));

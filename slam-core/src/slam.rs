@@ -26,7 +26,7 @@ use crate::pose::{components, is_finite, perpendicular, pose, rotate_covariance}
 use crate::registration::{
     Eye, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start, register_end_points,
 };
-use crate::scan::Scan;
+use crate::scan::{Scan, SensorConfig};
 use crate::segment::Segment;
 use crate::visibility::{is_gone, mark_seen_through};
 
@@ -179,6 +179,15 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let slam = place.write(Self::blank(config));
         slam.prepare();
         Ok(slam)
+    }
+
+    /// Takes another scanner, or the same one whose beams lie otherwise from now on, as scanners that do not turn evenly need it
+    /// before each scan. Map and pose stay.
+    pub fn set_sensor(&mut self, sensor: SensorConfig) -> Result<(), ConfigError> {
+        let config = SlamConfig { sensor, ..self.config };
+        Self::check(&config)?;
+        self.config = config;
+        Ok(())
     }
 
     pub(crate) fn check(config: &SlamConfig) -> Result<(), ConfigError> {

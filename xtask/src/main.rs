@@ -6,6 +6,7 @@ mod firmware;
 mod performance;
 mod run;
 mod size;
+mod stress;
 mod test;
 
 use std::process::ExitCode;
@@ -49,6 +50,15 @@ enum Task {
     Bench,
     /// Instructions of each stage of the core on an emulated Cortex-M4F, and of the functions it uses.
     BenchTarget,
+    /// Replay recorded logs changed in ways that a good system hardly notices, and print the trajectory error of each.
+    Stress {
+        /// Seeds of the noise on every range.
+        #[arg(long, default_value_t = 6)]
+        seeds: u32,
+        /// Names of the logs, with commas between; by default all that are there.
+        #[arg(long, value_name = "NAME,...")]
+        logs: Option<String>,
+    },
     /// Measure what docs/performance.md says, on the emulated core and on this PC, and write it.
     Performance,
 }
@@ -64,6 +74,7 @@ fn main() -> ExitCode {
         Task::Size => size::report(),
         Task::Bench => bench::report(),
         Task::BenchTarget => firmware::bench(),
+        Task::Stress { seeds, logs } => stress::report(seeds, logs.as_deref()),
         Task::Performance => performance::report(),
     };
     match done {

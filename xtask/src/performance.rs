@@ -27,7 +27,7 @@ const PEERS: &str = "\
 | Gmapping | a grid for each particle | 30 particles by default | docs.ros.org/api/gmapping |
 
 None of them was run here, and none of these figures is of this machine or of a microcontroller. What is measured here is all above
-this table. Accuracy on logs that others use too is in [experiments.md](experiments.md).
+this table. Accuracy on logs that others use too is in [benchmark.md](benchmark.md).
 ";
 
 /// Measures and writes.

@@ -40,7 +40,7 @@ pub fn everything() -> anyhow::Result<()> {
     size::report()?;
     bench::report()?;
     firmware::bench()?;
-    let python = referee_python();
+    let python = python_with_readers();
     tests(python, &elves)
 }
 
@@ -111,17 +111,18 @@ impl Sum {
     }
 }
 
-/// A Python with what the referee beside the recorded logs needs, made once in the target folder. Without the referee, or
-/// where it cannot be made, `None`: its test then says that it was skipped.
-fn referee_python() -> Option<PathBuf> {
-    if !root().join("../shared/referee/score.py").exists() {
-        return None;
-    }
-    let folder = root().join("target/referee-python");
+/// What the tests ask of a Python: numbers for the referee beside the recorded logs, and readers of what we write that
+/// know nothing of us.
+const PYTHON_PACKAGES: [&str; 6] = ["numpy", "scipy", "mcap", "mcap-ros2-support", "rosbags", "ezdxf"];
+
+/// A Python with those packages, made once in the target folder. Where it cannot be made, `None`: the tests that need it
+/// then say that they were skipped.
+pub(crate) fn python_with_readers() -> Option<PathBuf> {
+    let folder = root().join("target/python");
     let python = folder.join("bin/python3");
     let works = |python: &PathBuf| {
         Command::new(python)
-            .args(["-c", "import numpy, scipy"])
+            .args(["-c", "import numpy, scipy, mcap, mcap_ros2, rosbags, ezdxf"])
             .stderr(Stdio::null())
             .status()
             .is_ok_and(|s| s.success())
@@ -130,11 +131,9 @@ fn referee_python() -> Option<PathBuf> {
         return Some(python);
     }
     let made =
-        step("Python for the referee", program("python3").args(["-m", "venv"]).arg(&folder)).and_then(|()| {
-            step(
-                "numpy and scipy",
-                program(&python).args(["-m", "pip", "install", "--quiet", "numpy", "scipy"]),
-            )
+        step("Python for the tests", program("python3").args(["-m", "venv"]).arg(&folder)).and_then(|()| {
+            let mut install = program(&python);
+            step("its packages", install.args(["-m", "pip", "install", "--quiet"]).args(PYTHON_PACKAGES))
         });
     match made {
         Ok(()) if works(&python) => Some(python),

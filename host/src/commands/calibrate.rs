@@ -4,34 +4,28 @@ use std::path::PathBuf;
 
 use comfy_table::{CellAlignment, Table, presets};
 use lineslam::calibrate;
-use lineslam::log::{self, Format, ReadOptions};
 use lineslam::robot::Robot;
 
 use super::common::{progress_bar, write_one};
+use super::log_args::{LogArgs, warn};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The log, plain or gzipped, with wheel ticks.
-    log: PathBuf,
+    #[command(flatten)]
+    log: LogArgs,
     /// Robot file that describes the robot nearly.
     #[arg(long, value_name = "FILE")]
     robot: PathBuf,
-    /// Format of the log.
-    #[arg(long, value_enum, default_value_t = Format::Auto)]
-    format: Format,
     /// The robot file to write: the one given, with what the log told.
     #[arg(long, value_name = "FILE", default_value = "calibrated.toml")]
     out: PathBuf,
-    /// Skip and count records that cannot be read, instead of stopping at the first.
-    #[arg(long)]
-    lenient: bool,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     // Checked first: its beams are what the log must have.
     let robot = Robot::load(&args.robot)?;
-    let options = ReadOptions { format: args.format, beams: robot.beams(), lenient: args.lenient };
-    let log = log::read(&args.log, &options)?;
+    let log = args.log.read(Some(&robot), true)?;
+    warn(&log.warnings);
     let progress = progress_bar(calibrate::ROUNDS, "replays at most");
     let result = calibrate::calibrate(&log, &args.robot, || progress.inc(1))?;
     progress.finish_and_clear();

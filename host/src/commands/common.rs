@@ -1,16 +1,17 @@
 //! What several commands share.
 
 use std::io::IsTerminal;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::ValueEnum;
 use comfy_table::{CellAlignment, Table, presets};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use lineslam::log::Log;
+use lineslam::output::grid::Grid;
 use lineslam::output::report::Report;
-use lineslam::output::svg::Scene;
-use lineslam::output::{self, csv, grid, svg, tum};
+use lineslam::output::svg::{Picture, Scene};
+use lineslam::output::{self, csv, dxf, mcap, svg, trajectory_csv, tum};
 use lineslam::replay::{self, Replay, ReplayError};
 use lineslam::robot::Robot;
 use slam_core::SlamConfig;
@@ -59,34 +60,49 @@ pub fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Rep
     Ok(result)
 }
 
-/// The files that every run leaves behind.
+/// The files that every run leaves behind, and the recording for ROS where one is asked for.
 pub fn results(
+    log: &Log,
     result: &Replay,
     report: &Report,
     scene: &Scene<'_>,
-) -> anyhow::Result<Vec<(&'static str, Vec<u8>)>> {
-    let grid = grid::render(result).context("map.pgm")?;
-    Ok(vec![
+    recording: Option<&Path>,
+) -> anyhow::Result<Vec<(PathBuf, Vec<u8>)>> {
+    let grid = Grid::of(log, result);
+    let path = result.steps.iter().map(|step| &step.pose_in_final_map);
+    let mut files: Vec<(PathBuf, Vec<u8>)> = [
         ("trajectory.tum", tum::render(replay::trajectory(&result.steps)).into_bytes()),
+        ("trajectory_final.tum", tum::render(replay::final_trajectory(&result.steps)).into_bytes()),
+        ("trajectory.csv", trajectory_csv::render(&result.steps).context("trajectory.csv")?),
         ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),
         ("map.csv", csv::render(&result.map).context("map.csv")?),
-        ("map.svg", svg::render(&result.into(), scene).into_bytes()),
-        ("map.pgm", grid.pgm),
-        ("map.yaml", grid.yaml.into_bytes()),
+        ("map.svg", svg::render(&Picture::of(log, result), scene).into_bytes()),
+        ("map.dxf", dxf::render(&result.map, path).context("map.dxf")?),
+        ("map.pgm", grid.pgm().context("map.pgm")?),
+        ("map.yaml", grid.yaml().into_bytes()),
         ("report.json", report.render().context("report.json")?),
-    ])
+    ]
+    .map(|(name, bytes)| (name.into(), bytes))
+    .into();
+    if let Some(path) = recording {
+        let named = || path.display().to_string();
+        let bytes = mcap::render(log, result, &grid).with_context(named)?;
+        // Relative to where the command was called, not to the folder of the other files.
+        files.push((std::path::absolute(path).with_context(named)?, bytes));
+    }
+    Ok(files)
 }
 
 /// A bar on a terminal, nothing in a pipe.
 pub fn progress_bar(steps: usize, what: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{bar:40.cyan/dim} {pos}/{len} {msg}  {per_sec}  {eta} left")
         .expect("the template is a constant");
-    let target = if std::io::stderr().is_terminal() {
-        ProgressDrawTarget::stderr()
-    } else {
-        ProgressDrawTarget::hidden()
-    };
-    ProgressBar::with_draw_target(Some(steps as u64), target).with_style(style).with_message(what)
+    ProgressBar::with_draw_target(Some(steps as u64), terminal()).with_style(style).with_message(what)
+}
+
+/// Where progress is shown: on a terminal.
+pub fn terminal() -> ProgressDrawTarget {
+    if std::io::stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() }
 }
 
 pub fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {

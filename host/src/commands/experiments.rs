@@ -18,9 +18,6 @@ pub struct Args {
     /// Folder of the worlds hall, corridor, office and parallel.
     #[arg(long, value_name = "FOLDER", default_value = "worlds")]
     worlds: PathBuf,
-    /// Folder of recorded logs with their references; without it that part is left out.
-    #[arg(long, value_name = "FOLDER", env = "LINESLAM_DATA")]
-    data: Option<PathBuf>,
     /// Folder for experiments.md and images/.
     #[arg(long, value_name = "FOLDER", default_value = "docs")]
     out: PathBuf,
@@ -28,13 +25,12 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let seeds = args.first_seed..args.first_seed.saturating_add(u64::from(args.seeds));
-    let options = experiments::Options { worlds: args.worlds.clone(), data: args.data.clone(), seeds };
+    let options = experiments::Options { worlds: args.worlds.clone(), seeds };
     let progress = progress_bar(experiments::steps(&options), "drives");
     let results = experiments::run(&options, || progress.inc(1))?;
     progress.finish_and_clear();
-    let with_data = if results.recorded.is_empty() { "" } else { " --data LOGS" };
     let command = format!(
-        "cargo run --release -p lineslam -- experiments --seeds {} --first-seed {}{with_data}",
+        "cargo run --release -p lineslam -- experiments --seeds {} --first-seed {}",
         args.seeds, args.first_seed
     );
     let page = document::render(&results, &command, "images");
@@ -48,9 +44,6 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     output::write_all(&args.out, &files)?;
     println!("{}\n\n{}", document::buildings(&results), document::robustness(&results));
     println!("\n{}\n\n{}", document::honesty(&results), document::featureless(&results));
-    if !results.recorded.is_empty() {
-        println!("\n{}\n\n{}", document::recorded(&results.recorded), document::walls(&results.recorded));
-    }
     println!("\nwritten to {}", args.out.join("experiments.md").display());
     Ok(())
 }

@@ -1,8 +1,11 @@
 //! The commands, one a file.
 
+pub mod benchmark;
 pub mod calibrate;
 pub mod common;
 pub mod experiments;
+pub mod log_args;
 pub mod replay;
 pub mod scan;
+pub mod score;
 pub mod simulate;

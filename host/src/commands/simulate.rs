@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use lineslam::log;
 use lineslam::output::report::{Report, SimulationReport};
 use lineslam::output::svg::Scene;
 use lineslam::output::{self, tum};
@@ -24,9 +25,12 @@ pub struct Args {
     /// Which algorithm: the best we know, or the paper step for step.
     #[arg(long, value_enum, default_value_t = Configuration::Default)]
     config: Configuration,
-    /// Folder for all that replay writes, and for log.dat, which replay reads, and truth.tum.
+    /// Folder for all that replay writes, and for log.jsonl, which replay reads, and truth.tum.
     #[arg(long, value_name = "FOLDER", default_value = "out")]
     out: PathBuf,
+    /// Also record the run as ROS 2 messages in this MCAP file, for ros2 bag play, RViz and Foxglove.
+    #[arg(long, value_name = "FILE")]
+    mcap: Option<PathBuf>,
     /// Change an error of the simulated robot: wheel.radius_error, wheel.radius_difference, wheel.track_error,
     /// wheel.slip_m_per_sqrt_m, sensor.sigma_m, sensor.sigma_per_m, sensor.uniform_m, sensor.dropout,
     /// sensor.mixed_pixels, sensor.least_incidence, sensor.skip_every, sensor.delay_s.
@@ -53,10 +57,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         blueprint: &blueprint,
         ..Scene::default()
     };
-    let mut files = results(&result, &report, &scene)?;
-    files.push(("log.dat", sim::mines_text(&drive.log).into_bytes()));
+    let mut files = results(&drive.log, &result, &report, &scene, args.mcap.as_deref())?;
+    files.push(("log.jsonl".into(), log::plain_text(&drive.log, &robot).into_bytes()));
     let stamps = drive.log.scans.iter().map(|s| s.stamp_us);
-    files.push(("truth.tum", tum::render_f64(stamps.zip(&drive.truth)).into_bytes()));
+    files.push(("truth.tum".into(), tum::render_f64(stamps.zip(&drive.truth)).into_bytes()));
     output::write_all(&args.out, &files)?;
     print_summary("world", &caption, &args.out, &report);
     Ok(())

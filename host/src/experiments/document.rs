@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use comfy_table::{CellAlignment, Row, Table, presets};
 
-use super::{BUILDINGS, CONDITIONS, FEATURELESS, LOST_M, Measured, PASS_M, Recorded, Results, Run};
+use super::{BUILDINGS, CONDITIONS, FEATURELESS, LOST_M, Measured, Results, Run};
 use crate::score::Spread;
 use crate::sim::judge::NEES_INSTANTS;
 
@@ -197,73 +197,6 @@ pub fn featureless(results: &Results) -> Table {
     table
 }
 
-/// Absolute trajectory errors on recorded logs.
-pub fn recorded(recorded: &[Recorded]) -> Table {
-    let mut table = table([
-        "log",
-        "scans",
-        "dead reckoning",
-        "paper",
-        "default",
-        "without closing loops",
-        "loops closed",
-        "relations checked by hand, mean",
-    ]);
-    for log in recorded {
-        table.add_row([
-            log.name.to_owned(),
-            log.scans.to_string(),
-            metres(log.dead_reckoning_m),
-            metres(log.paper_m),
-            metres(log.default_m),
-            metres(log.open_loop_m),
-            log.loops_closed.to_string(),
-            log.relations_m.map_or_else(|| "–".into(), metres),
-        ]);
-    }
-    table
-}
-
-/// How thick the walls of recorded logs are, laid by our poses and by the reference's.
-pub fn walls(recorded: &[Recorded]) -> Table {
-    let mut table = table([
-        "log",
-        "whole map",
-        "by the reference",
-        &format!("each {PASS_M} m of way alone"),
-        "by the reference",
-    ]);
-    for log in recorded {
-        let (ours, theirs) = (&log.walls, &log.reference_walls);
-        let numbers = [ours.whole_m, theirs.whole_m, ours.pass_m, theirs.pass_m].map(|m| format!("{m:.4}"));
-        table.add_row(std::iter::once(log.name.to_owned()).chain(numbers));
-    }
-    table
-}
-
-/// Walls thicker than the reference's by no more than this factor count as equally thin.
-const AS_THIN: f64 = 1.1;
-
-/// Which logs a pose graph would help, as their walls say.
-fn without_pose_graph(recorded: &[Recorded]) -> String {
-    let thicker = |ours: f64, reference: f64| ours > AS_THIN * reference;
-    let names = |which: &dyn Fn(&Recorded) -> bool| -> Option<String> {
-        let names: Vec<&str> = recorded.iter().filter(|log| which(log)).map(|log| log.name).collect();
-        (!names.is_empty()).then(|| names.join(", "))
-    };
-    let whole = |log: &Recorded| thicker(log.walls.whole_m, log.reference_walls.whole_m);
-    let pass = |log: &Recorded| thicker(log.walls.pass_m, log.reference_walls.pass_m);
-    let mut text = format!("Thicker than the reference's by more than {:.0} %:", 100.0 * (AS_THIN - 1.0));
-    let mut add = |what: &str, names: Option<String>| {
-        let _ = write!(text, " {what} {};", names.unwrap_or_else(|| "none".into()));
-    };
-    add("within a pass", names(&pass));
-    add("only where passes lie on each other", names(&|log| whole(log) && !pass(log)));
-    text.pop();
-    text + ".\nThe latter need a pose graph: the references were corrected once their loops were closed, ours are the poses as the\n\
-            robot knew them then, and what is seen again moves only the poses that follow."
-}
-
 /// Mean trajectory error of the paper's algorithm in a building, in one of its two series.
 fn paper_error(results: &Results, world: &str, series: fn(&Run) -> Option<&Measured>) -> String {
     metres(mean(drives(results, world, 0).filter_map(series).map(|m| m.judgement.trajectory.ate_rmse_m)))
@@ -279,6 +212,7 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
     };
     say("# Experiments");
     say(&format!("All of this page, figures included, is written by\n\n```sh\n{command}\n```"));
+    say("Simulated drives. Recorded logs that others use too are in [benchmark.md](benchmark.md).");
     say("## The paper's buildings");
     say(&format!(
         "Simulated drives with seeds {first} to {last}. Each seed draws wheels that are 1 % larger or smaller than the\n\
@@ -327,29 +261,6 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
     say("## Two parallel walls");
     say("30 m between two walls without any feature. Along them only the wheels know.");
     say(&featureless(results).to_string());
-    say("## Recorded logs");
-    if results.recorded.is_empty() {
-        say("Not run: no folder of recorded logs was given.");
-    } else {
-        say(
-            "Absolute trajectory error, rmse in metres after one SE(2) alignment, of the poses as the robot knew them then:",
-        );
-        say(&recorded(&results.recorded).to_string());
-        say(
-            "There is no pose graph. Where the column of closed loops is zero, coming back was enough: what is seen again pulls\n\
-             the pose, and with it the lines that are tracked.",
-        );
-        say(&format!(
-            "How thick walls are when each scan is laid where its pose says: the standard deviation of the points within 0.3 m of a\n\
-             point, across their wall, median over all points, metres. Within {PASS_M} m of way nothing is come back to."
-        ));
-        say(&walls(&results.recorded).to_string());
-        say(&without_pose_graph(&results.recorded));
-        say("Map and path (red), with the reference trajectory (green) laid on it, Fig. 10:");
-        for log in &results.recorded {
-            say(&format!("![Map of {}]({images}/{}.svg)", log.name, log.name));
-        }
-    }
     page.truncate(page.trim_end().len());
     page.push('\n');
     page

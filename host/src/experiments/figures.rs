@@ -1,14 +1,12 @@
-//! The figures: map over blueprint or reference, and what dead reckoning would have drawn.
+//! The figures: map over blueprint, and what dead reckoning would have drawn.
 
 use nalgebra::Isometry2;
 use slam_core::SlamConfig;
 
 use super::Figure;
-use crate::log::Log;
-use crate::output::svg::{self, Scene};
+use crate::output::svg::{self, Picture, Scene};
 use crate::replay::{self, Replay, ReplayError, Step};
 use crate::robot::Robot;
-use crate::score::{self, StampedPose};
 use crate::sim::world::World;
 use crate::sim::{self, SimConfig, judge};
 
@@ -24,7 +22,7 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
     let title = format!("{}, seed {seed}", world.name);
     let draw = |replay: &Replay, subtitle: &str| {
         svg::render(
-            &replay.into(),
+            &Picture::of(&drive.log, replay),
             &Scene { title: &title, subtitle, blueprint: &blueprint, reference: &truth },
         )
     };
@@ -34,27 +32,6 @@ pub fn simulated(world: &World, seed: u64) -> Result<Vec<Figure>, ReplayError> {
             .push((format!("{}_dead_reckoning.svg", world.name), draw(&by_wheels(replay), "dead reckoning")));
     }
     Ok(figures)
-}
-
-/// The map of a recorded log, with the reference trajectory laid on it.
-pub fn recorded(
-    name: &str,
-    log: &Log,
-    replay: &Replay,
-    poses: &[StampedPose],
-    reference: &[StampedPose],
-) -> Figure {
-    let reference: Vec<Isometry2<f32>> = score::align(reference, poses)
-        .map(|alignment| {
-            let carried =
-                |p: &StampedPose| nalgebra::convert_unchecked(alignment.reference_from_estimate * p.pose);
-            reference.iter().map(carried).collect()
-        })
-        .unwrap_or_default();
-    let title = format!("{name} ({})", log.format);
-    let scene =
-        Scene { title: &title, subtitle: "default configuration", reference: &reference, ..Scene::default() };
-    (format!("{name}.svg"), svg::render(&replay.into(), &scene))
 }
 
 /// The same scans where the wheels say they were taken, without a map.

@@ -2,10 +2,13 @@
 //! them on disk, all or none.
 
 pub mod csv;
+pub mod dxf;
 pub mod grid;
+pub mod mcap;
 pub mod report;
 pub mod scan;
 pub mod svg;
+pub mod trajectory_csv;
 pub mod tum;
 
 use std::io::Write;
@@ -31,7 +34,7 @@ pub struct WriteError {
     pub source: std::io::Error,
 }
 
-/// Writes named files into a folder; folders that are missing are made. All contents are on disk under temporary names
+/// Writes named files into a folder, or where an absolute name says; folders that are missing are made. All contents are on disk under temporary names
 /// before the first one gets its own.
 pub fn write_all<N: AsRef<Path>>(folder: &Path, files: &[(N, Vec<u8>)]) -> Result<(), WriteError> {
     let failed = |path: &Path| {

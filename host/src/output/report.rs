@@ -9,7 +9,7 @@ use slam_core::correction::Verdict;
 use slam_core::map::MapCounters;
 use slam_core::slam::Counters;
 
-use crate::log::Log;
+use crate::log::{Log, Warning, doubts};
 use crate::replay::Replay;
 use crate::robot::Robot;
 use crate::sim::judge::{self, Judgement, TrajectoryErrors};
@@ -29,6 +29,8 @@ pub struct Report {
     pub scans_used: usize,
     /// Records skipped, by reason.
     pub records_skipped: BTreeMap<&'static str, usize>,
+    /// What looks wrong: what is suspected, from what number, and what to pass to mend it.
+    pub warnings: Vec<Warning>,
     /// Segments of the final map.
     pub segments: usize,
     /// Way driven, by odometry, metres.
@@ -138,12 +140,18 @@ impl Report {
             };
             *observability.entry(verdict).or_default() += 1;
         }
+        let mut records_skipped = log.skipped.clone();
+        if replay.impossible_steps > 0 {
+            *records_skipped.entry("odometry_impossible_step").or_default() += replay.impossible_steps;
+        }
+        let warnings = log.warnings.iter().cloned().chain(doubts::of_drive(log, robot, replay)).collect();
         Self {
             format: log.format,
             robot: robot.name.clone(),
             configuration: configuration.to_owned(),
             scans_used: replay.steps.len(),
-            records_skipped: log.skipped.clone(),
+            records_skipped,
+            warnings,
             segments: replay.map.len(),
             distance_m: replay.distance_m,
             duration_s: stamps.map_or(0.0, |(a, b)| (b.stamp_us - a.stamp_us) as f64 * 1e-6),

@@ -12,6 +12,8 @@ use svg::Document;
 use svg::node::element::{Circle, Group, Line, Path, Rectangle, Text};
 
 use super::bounds;
+use crate::beams::all_in_final_map;
+use crate::log::Log;
 use crate::replay::{ESTABLISHED_HITS, Replay};
 use crate::sim::world::Edge;
 
@@ -33,6 +35,8 @@ const FOOTER_PX: f32 = 58.0;
 const LEAST_WIDTH_PX: f32 = 1200.0;
 /// Scan points are thinned to one a cell of this size, metres, and drawn up to this range.
 const POINT_CELL_M: f32 = 0.04;
+/// The same for pictures, pixels.
+const POINT_CELL_PX: f32 = 1.8;
 
 /// What is drawn beside map and path.
 #[derive(Default)]
@@ -56,20 +60,25 @@ pub struct Picture<'a> {
     pub path: Vec<Isometry2<f32>>,
     /// The same by dead reckoning.
     pub odometry: Vec<Isometry2<f32>>,
-    /// Points of all scans.
+    /// Points of all scans, or some of them.
     pub points: Vec<Point2<f32>>,
     /// Way driven, metres.
     pub distance_m: f64,
 }
 
-impl<'a> From<&'a Replay> for Picture<'a> {
-    fn from(replay: &'a Replay) -> Self {
-        let points = replay.steps.iter().flat_map(|s| s.points.iter().map(|p| s.pose_in_final_map * p));
+impl<'a> Picture<'a> {
+    /// Of a replayed log.
+    pub fn of(log: &Log, replay: &'a Replay) -> Self {
+        let mut points = Vec::new();
+        let mut cells = HashSet::new();
+        for seen in all_in_final_map(log, replay) {
+            points.extend(seen.obstacles().filter(|p| cells.insert(point_cell(p, POINT_CELL_M))));
+        }
         Self {
             map: &replay.map,
             path: replay.steps.iter().map(|s| s.pose_in_final_map).collect(),
             odometry: replay.steps.iter().map(|s| s.odometry).collect(),
-            points: points.collect(),
+            points,
             distance_m: replay.distance_m,
         }
     }
@@ -183,12 +192,17 @@ fn blueprint_lines(blueprint: &[Edge], view: &View) -> Path {
     path.set("stroke-linecap", "round").set("fill", "none")
 }
 
+fn point_cell(point: &Point2<f32>, cell_m: f32) -> (i32, i32) {
+    ((point.x / cell_m).floor() as i32, (point.y / cell_m).floor() as i32)
+}
+
 fn scan_points(points: &[Point2<f32>], view: &View) -> Path {
     let mut cells = HashSet::new();
     let mut d = String::new();
+    // In the picture of a large building finer ones would fall together.
+    let cell_m = POINT_CELL_M.max(POINT_CELL_PX / view.px_per_m);
     for p in points {
-        let cell = ((p.x / POINT_CELL_M).floor() as i32, (p.y / POINT_CELL_M).floor() as i32);
-        if view.holds(*p) && cells.insert(cell) {
+        if view.holds(*p) && cells.insert(point_cell(p, cell_m)) {
             let (x, y) = view.px(*p);
             let _ = write!(d, "M{x} {y}h0");
         }

@@ -24,10 +24,14 @@ pub fn render_f64<'a>(poses: impl Iterator<Item = (u64, &'a Isometry2<f64>)>) ->
     text
 }
 
+/// A stamp in seconds with its six decimals.
+pub(super) fn seconds(stamp_us: u64) -> String {
+    format!("{}.{:06}", stamp_us / 1_000_000, stamp_us % 1_000_000)
+}
+
 fn line(text: &mut String, stamp_us: u64, x_m: f64, y_m: f64, theta_rad: f64) {
     let half = 0.5 * theta_rad;
     let (qz, qw) = (libm::sin(half), libm::cos(half));
-    let (seconds, micros) = (stamp_us / 1_000_000, stamp_us % 1_000_000);
     // Writing to a String cannot fail.
-    let _ = writeln!(text, "{seconds}.{micros:06} {x_m:.6} {y_m:.6} 0 0 0 {qz:.9} {qw:.9}");
+    let _ = writeln!(text, "{} {x_m:.6} {y_m:.6} 0 0 0 {qz:.9} {qw:.9}", seconds(stamp_us));
 }

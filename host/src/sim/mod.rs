@@ -10,8 +10,6 @@ pub mod judge;
 pub mod scanner;
 pub mod world;
 
-use std::fmt::Write;
-
 use nalgebra::Isometry2;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
@@ -187,7 +185,7 @@ pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result
     let middle_us = first_beam_us + 0.5 * geometry.sweep_us() as f64;
     let delay_us = (sim.sensor.delay_s * 1e6).round().max(0.0);
     let mut drive = Drive {
-        log: Log { format: "mines", ..Log::default() },
+        log: Log { format: "simulated", commonest_beams: geometry.beams(), ..Log::default() },
         truth: Vec::new(),
         true_wheels: base.truth(),
     };
@@ -217,7 +215,7 @@ pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result
         let stamp_us = FIRST_STAMP_US + stamped_us;
         drive.truth.push(at(begin_us as f64 + middle_us));
         drive.log.odometry.push((stamp_us, Odometry::Ticks(ticks[(stamped_us / STEP_US) as usize])));
-        drive.log.scans.push(LoggedScan { line: k as usize + 1, stamp_us, ranges_mm });
+        drive.log.scans.push(LoggedScan { line: k as usize + 1, stamp_us, ranges_mm, geometry: None });
     }
     Ok(drive)
 }
@@ -231,19 +229,4 @@ pub fn streams(seed: u64) -> [Pcg64; 2] {
 pub fn interpolate(poses: &[Isometry2<f64>], step: f64) -> Isometry2<f64> {
     let index = (step.max(0.0) as usize).min(poses.len().saturating_sub(2));
     poses[index].lerp_slerp(&poses[index + 1], (step - index as f64).clamp(0.0, 1.0))
-}
-
-/// The log in the mines format, which `replay` reads.
-pub fn mines_text(log: &Log) -> String {
-    let mut text = String::new();
-    for (scan, (_, odometry)) in log.scans.iter().zip(&log.odometry) {
-        let Odometry::Ticks([left, right]) = odometry else { continue };
-        // Writing to a String cannot fail.
-        let _ = write!(text, "{} 0 {left} {right}{}", scan.stamp_us, " 0".repeat(20));
-        for range_mm in &scan.ranges_mm {
-            let _ = write!(text, " {range_mm}");
-        }
-        text.push_str(" 0\n");
-    }
-    text
 }
