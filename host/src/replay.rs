@@ -26,7 +26,8 @@ pub(crate) const MOST_BEAMS: usize = 8192;
 const TRACK: usize = 256;
 /// Where there is no odometry the robot may move this fast, m/s and rad/s, …
 const UNKNOWN_SPEED: [f32; 2] = [0.5, 1.0];
-/// … which makes the pose this unsure: between scans 0.1 s apart by a decimetre and six degrees.
+/// … which makes the pose this unsure: between scans 0.1 s apart by a decimetre and six degrees. Chosen on one log, of a scanner
+/// carried by hand (ccny_demo).
 const UNKNOWN_MOTION: OdometryNoise = OdometryNoise {
     sigma_along_m_per_sqrt_m: 0.3,
     sigma_across_m_per_sqrt_m: 0.3,

@@ -8,7 +8,7 @@ use crate::log::records::ScanRecord;
 use crate::log::{Defect, Format, LogError, LoggedScan};
 use crate::score::Spread;
 
-/// So small a share of the scans may be out of order without being asked about.
+/// So small a share of the scans may be out of order without being asked about. Ours; no recorded log at hand has any.
 const FEW: f64 = 0.02;
 /// Scans without stamps are taken to be this far apart, microseconds.
 pub(super) const MADE_UP_US: i64 = 100_000;
