@@ -45,6 +45,10 @@ fn constants(path: &Path) -> String {
             std::process::exit(1);
         }
     };
+    // Built-in profiles are part of the crate that reads them.
+    for profile in &robot.profile_files {
+        println!("cargo::rerun-if-changed={}", profile.display());
+    }
     let (Some(drive), Some(_)) = (robot.drive(), robot.beams()) else {
         println!("cargo::error=LINESLAM_ROBOT={}: [wheels] and [sensor.steps] are needed", path.display());
         std::process::exit(1);
@@ -56,8 +60,11 @@ fn constants(path: &Path) -> String {
         "/// Name of the robot file's robot.\n\
          pub const NAME: &str = {:?};\n\
          /// Its wheels.\n\
-         pub const DRIVE: slam_core::odometry::DifferentialDrive = slam_core::odometry::{drive:?};\n",
+         pub const DRIVE: slam_core::odometry::DifferentialDrive = slam_core::odometry::{drive:?};\n\
+         /// Microseconds from a scan's middle beam to the time that its stamp says.\n\
+         pub const SCAN_DELAY_US: i64 = {};\n",
         robot.name,
+        (robot.sensor.scan_delay_s * 1e6).round() as i64,
     ) + &format!(
         "/// Puts sensor, mounting and odometry into a configuration.\n\
          pub fn apply(config: &mut slam_core::SlamConfig) {{\n\

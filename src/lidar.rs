@@ -10,6 +10,7 @@ use scip::client::EmbassyClock;
 use scip::{Client, ClientConfig};
 
 use crate::board::LidarPins;
+use crate::robot::SCAN_DELAY_US;
 
 /// Room for the ranges of a scan.
 pub const BEAMS: usize = 682;
@@ -97,7 +98,8 @@ pub async fn run(pins: LidarPins, mut scans: Sender<'static, CriticalSectionRawM
                     );
                 }
                 buffer.len = scan.ranges;
-                buffer.middle_us = scan.beam_us(0).midpoint(scan.beam_us(scan.ranges.saturating_sub(1)));
+                let stamped_us = scan.beam_us(0).midpoint(scan.beam_us(scan.ranges.saturating_sub(1)));
+                buffer.middle_us = stamped_us.saturating_add_signed(-SCAN_DELAY_US);
                 scans.send_done();
             }
             Err(error) => {

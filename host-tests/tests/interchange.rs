@@ -33,7 +33,7 @@ fn robot(changes: &[(&str, &str)]) -> Robot {
         assert!(text.contains(from), "'{from}' is not in paper.toml");
         text = text.replacen(from, to, 1);
     }
-    toml_file::parse(&text, &path).unwrap()
+    Robot::parse(&text, &path).unwrap()
 }
 
 fn drive() -> Drive {
@@ -113,6 +113,9 @@ fn a_run_is_read_by_others() {
 fn a_scanner_head_down_is_read_by_others() {
     let mut drive = drive();
     drive.log.scans.iter_mut().for_each(|scan| scan.ranges_mm.reverse());
-    let robot = robot(&[("front = 384", "front = 385"), ("upside_down = false", "upside_down = true")]);
+    let robot = robot(&[
+        ("[mounting]", "[sensor.steps]\nfront = 385\n\n[mounting]"),
+        ("upside_down = false", "upside_down = true"),
+    ]);
     read_by_others("a_scanner_head_down_is_read_by_others", &drive, &robot);
 }

@@ -25,7 +25,9 @@ const WORLD: &str = "../worlds/office.toml";
 fn robot(beams: usize) -> Robot {
     let text = std::fs::read_to_string(ROBOT).expect("the robot file is there");
     let mut table: toml::Table = text.parse().expect("the robot file is TOML");
-    let steps = table["sensor"]["steps"].as_table_mut().expect("it has sensor.steps");
+    let sensor = table["sensor"].as_table_mut().expect("it has a sensor");
+    let steps = sensor.entry("steps").or_insert(toml::Table::new().into());
+    let steps = steps.as_table_mut().expect("sensor.steps is a table");
     let last = beams as i64 - 1;
     steps.insert("first".into(), 0.into());
     steps.insert("last".into(), last.into());

@@ -149,7 +149,7 @@ pub fn calibrate(
     mut progress: impl FnMut(),
 ) -> Result<Calibration, CalibrationError> {
     let text = toml_file::read(robot_path)?;
-    let robot: Robot = toml_file::parse(&text, robot_path)?;
+    let robot = Robot::parse(&text, robot_path)?;
     let wheels = robot.wheels.ok_or_else(|| ReplayError::NoWheels { robot: robot.name.clone() })?;
     // The text has just been parsed.
     let mut document: DocumentMut = text.parse().expect("what serde reads, the editor reads");
@@ -157,7 +157,7 @@ pub fn calibrate(
     let before = Vector::from_fn(|i, _| number_in(&document, KINDS[i].key) * KINDS[i].unit);
     let mut now = Estimate { value: before, sigma: Vector::repeat(f64::INFINITY), windows: 0 };
     for round in 0..ROUNDS {
-        let robot: Robot = toml_file::parse(&document.to_string(), robot_path)?;
+        let robot = Robot::parse(&document.to_string(), robot_path)?;
         let windows = windows(log, &robot, &now.value)?;
         progress();
         let last = now.value;
@@ -191,7 +191,7 @@ pub fn calibrate(
         set_number(&mut document, parameter.key, kept);
     }
     // What was written must be a robot file too.
-    toml_file::parse::<Robot>(&document.to_string(), robot_path)?;
+    Robot::parse(&document.to_string(), robot_path)?;
     Ok(Calibration { parameters, windows: now.windows, robot_file: document.to_string() })
 }
 

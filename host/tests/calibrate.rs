@@ -129,18 +129,9 @@ fn a_log_without_ticks_and_a_robot_without_wheels_are_clear_errors() {
     let output = command(&log, &sick, &out);
     assert_eq!(output.status.code(), Some(2), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stderr).contains("no [wheels]"), "{output:?}");
-    let with_wheels = PAPER.replace("[sensor.steps]", "[sensor.field]\nof_view_deg = 180.0\n#[sensor.steps]");
-    let cut: String = with_wheels
-        .lines()
-        .filter(|l| {
-            !["first =", "last =", "front =", "per_revolution =", "revolution_s =", "used ="]
-                .iter()
-                .any(|k| l.starts_with(k))
-        })
-        .map(|l| format!("{l}\n"))
-        .collect();
+    let with_wheels = PAPER.replace("[mounting]", "[sensor.field]\nof_view_deg = 180.0\n\n[mounting]");
     let robot = folder.path().join("wheels.toml");
-    std::fs::write(&robot, cut).unwrap();
+    std::fs::write(&robot, with_wheels).unwrap();
     let output = command(&log, &robot, &out);
     assert_eq!(output.status.code(), Some(2), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stderr).contains("not wheel ticks"), "{output:?}");

@@ -518,15 +518,61 @@ fn lenient_reading_uses_a_log_that_was_cut_off() {
     assert_eq!(bench.report()["records_skipped"]["cut_off"], 1);
 }
 
+/// A robot whose file names no profile.
+const SPELLED_OUT: &str = r#"
+name = "rover"
+
+[wheels]
+left_radius_m = 0.077
+right_radius_m = 0.077
+track_m = 0.308
+ticks_per_turn = 2000.0
+counter_bits = 32
+
+[odometry_noise]
+along_m_per_sqrt_m = 0.02
+across_m_per_sqrt_m = 0.02
+heading_deg_per_sqrt_m = 2.0
+heading_deg_per_sqrt_turn_deg = 0.5
+position_floor_m = 0.002
+heading_floor_deg = 0.15
+
+[sensor]
+model = "URG-04LX"
+min_range_mm = 21
+max_range_mm = 5600
+no_echo_mm = [[0, 0], [6, 6]]
+sigma_m = 0.01
+sigma_per_m = 0.01
+sigma_bearing_deg = 0.75
+line_sigma_m = 0.02
+scan_delay_s = 0.15
+
+[sensor.steps]
+first = 44
+last = 725
+front = 384
+per_revolution = 1024.0
+revolution_s = 0.1
+used = [114, 655]
+
+[mounting]
+x_m = 0.145
+y_m = 0.0
+yaw_deg = -0.176
+upside_down = false
+"#;
+
 #[test]
 fn robot_files_are_checked_key_by_key() {
-    let good = include_str!("../../robots/mines.toml");
-    let cases: [(&str, &str, &[&str]); 12] = [
+    let good = SPELLED_OUT;
+    let cases: [(&str, &str, &[&str]); 13] = [
         ("track_m = 0.308", "track_m = 0.308\ntrak_m = 1", &["trak_m"]),
         ("track_m = 0.308\n", "", &["track_m", "missing"]),
         ("track_m = 0.308", "track_m = -0.3", &["wheels.track_m", "-0.3"]),
         ("track_m = 0.308", "track_m = \"wide\"", &["track_m", "string"]),
         ("counter_bits = 32", "counter_bits = 24", &["wheels.counter_bits", "24"]),
+        ("sigma_m = 0.01\n", "", &["sensor.sigma_m", "missing"]),
         ("max_range_mm = 5600", "max_range_mm = 10", &["sensor.max_range_mm", "10"]),
         ("max_range_mm = 5600", "max_range_mm = 70000", &["sensor.max_range_mm", "70000"]),
         ("[[0, 0], [6, 6]]", "[[6, 0]]", &["sensor.no_echo_mm", "[6, 0]"]),

@@ -3,5 +3,8 @@
 #![forbid(unsafe_code)]
 #![deny(missing_docs)]
 
+pub mod odometry;
+pub mod profile;
 pub mod robot;
+pub mod sensor;
 pub mod toml_file;

@@ -1,20 +1,22 @@
 //! Robot files: wheels, encoders, scanner and mounting, in TOML.
 //!
-//! Every key is needed and no other is known, so that a slip of the pen is an error that names it, with the file.
+//! What belongs to the type of scanner or base may come from a [profile](crate::profile). Every key is needed, there or here, and
+//! no other is known, so that a slip of the pen is an error that names it, with the file.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use slam_core::SlamConfig;
-use slam_core::odometry::{DifferentialDrive, OdometryNoise, ticks_between_u16, ticks_between_u32};
+use slam_core::odometry::{DifferentialDrive, ticks_between_u16, ticks_between_u32};
 use slam_core::pose::pose;
-use slam_core::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
+use slam_core::scan::{Mounting, RangeNoise, ScanGeometry, SensorConfig};
 
-use crate::toml_file::{self, Checked, FileError, Impossible, finite, not_negative, positive};
+use crate::odometry::{NoiseFile, NoiseText};
+use crate::sensor::{Sensor, SensorText};
+use crate::toml_file::{self, FileError, Impossible, finite, positive};
 
 /// A robot, as its file describes it.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Debug)]
 pub struct Robot {
     /// What it is called in reports.
     pub name: String,
@@ -27,8 +29,20 @@ pub struct Robot {
     /// Where the scanner sits.
     pub mounting: MountingFile,
     /// Whether nobody described this robot: what a log states goes before it.
-    #[serde(skip)]
     pub usual: bool,
+    /// Files of profiles that were read beside the robot file.
+    pub profile_files: Vec<PathBuf>,
+}
+
+/// A robot file as written.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RobotText {
+    name: String,
+    wheels: Option<Wheels>,
+    odometry_noise: NoiseText,
+    sensor: SensorText,
+    mounting: MountingFile,
 }
 
 /// `[wheels]`
@@ -55,73 +69,6 @@ impl Wheels {
             _ => ticks_between_u32(before[side] as u32, after[side] as u32),
         })
     }
-}
-
-/// `[odometry_noise]`, standard deviations that grow with the square root of the way.
-#[derive(Clone, Copy, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct NoiseFile {
-    along_m_per_sqrt_m: f32,
-    across_m_per_sqrt_m: f32,
-    heading_deg_per_sqrt_m: f32,
-    /// Degrees for each square root of a degree turned.
-    heading_deg_per_sqrt_turn_deg: f32,
-    position_floor_m: f32,
-    heading_floor_deg: f32,
-}
-
-impl NoiseFile {
-    /// All that grows with the way, so many times as large.
-    #[must_use]
-    pub fn times(&self, factor: f32) -> Self {
-        Self {
-            along_m_per_sqrt_m: factor * self.along_m_per_sqrt_m,
-            across_m_per_sqrt_m: factor * self.across_m_per_sqrt_m,
-            heading_deg_per_sqrt_m: factor * self.heading_deg_per_sqrt_m,
-            heading_deg_per_sqrt_turn_deg: factor * self.heading_deg_per_sqrt_turn_deg,
-            ..*self
-        }
-    }
-}
-
-/// `[sensor]`
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Sensor {
-    /// What it is, for people.
-    pub model: String,
-    min_range_mm: u32,
-    max_range_mm: u32,
-    no_echo_mm: Vec<[u32; 2]>,
-    sigma_m: f32,
-    sigma_per_m: f32,
-    /// Standard deviation of a beam's bearing, degrees.
-    sigma_bearing_deg: f32,
-    /// Standard deviation of what does not average out over a line's points, metres.
-    line_sigma_m: f32,
-    /// Time from the middle beam to the stamp logged with the scan, seconds.
-    pub scan_delay_s: f64,
-    steps: Option<Steps>,
-    field: Option<Field>,
-}
-
-/// `[sensor.steps]`: a scanner whose beams are known beforehand, in SCIP's terms.
-#[derive(Clone, Copy, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Steps {
-    first: u16,
-    last: u16,
-    front: u16,
-    per_revolution: f32,
-    revolution_s: f64,
-    used: [u16; 2],
-}
-
-/// `[sensor.field]`: a scanner whose number of beams the log states.
-#[derive(Clone, Copy, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Field {
-    of_view_deg: f32,
 }
 
 /// `[mounting]`
@@ -169,39 +116,51 @@ impl ScanLayout<'_> {
     }
 }
 
-impl Checked for Robot {
+impl Wheels {
     fn check(&self) -> Result<(), Impossible> {
-        if let Some(w) = &self.wheels {
-            positive("wheels.left_radius_m", w.left_radius_m)?;
-            positive("wheels.right_radius_m", w.right_radius_m)?;
-            positive("wheels.track_m", w.track_m)?;
-            positive("wheels.ticks_per_turn", w.ticks_per_turn)?;
-            if w.counter_bits != 16 && w.counter_bits != 32 {
-                return Err((
-                    "wheels.counter_bits".into(),
-                    format!("{} is neither 16 nor 32", w.counter_bits),
-                ));
-            }
+        positive("wheels.left_radius_m", self.left_radius_m)?;
+        positive("wheels.right_radius_m", self.right_radius_m)?;
+        positive("wheels.track_m", self.track_m)?;
+        positive("wheels.ticks_per_turn", self.ticks_per_turn)?;
+        if self.counter_bits != 16 && self.counter_bits != 32 {
+            let reason = format!("{} is neither 16 nor 32", self.counter_bits);
+            return Err(("wheels.counter_bits".into(), reason));
         }
-        let n = &self.odometry_noise;
-        not_negative("odometry_noise.along_m_per_sqrt_m", n.along_m_per_sqrt_m)?;
-        not_negative("odometry_noise.across_m_per_sqrt_m", n.across_m_per_sqrt_m)?;
-        not_negative("odometry_noise.heading_deg_per_sqrt_m", n.heading_deg_per_sqrt_m)?;
-        not_negative("odometry_noise.heading_deg_per_sqrt_turn_deg", n.heading_deg_per_sqrt_turn_deg)?;
-        positive("odometry_noise.position_floor_m", n.position_floor_m)?;
-        positive("odometry_noise.heading_floor_deg", n.heading_floor_deg)?;
-        self.check_sensor()?;
-        let m = &self.mounting;
-        finite("mounting.x_m", m.x_m)?;
-        finite("mounting.y_m", m.y_m)?;
-        finite("mounting.yaw_deg", m.yaw_deg)
+        Ok(())
+    }
+}
+
+impl MountingFile {
+    fn check(&self) -> Result<(), Impossible> {
+        finite("mounting.x_m", self.x_m)?;
+        finite("mounting.y_m", self.y_m)?;
+        finite("mounting.yaw_deg", self.yaw_deg)
     }
 }
 
 impl Robot {
-    /// Reads and checks a robot file.
+    /// Reads and checks a robot file, and the profiles that it names.
     pub fn load(path: &Path) -> Result<Self, FileError> {
-        toml_file::load(path)
+        Self::parse(&toml_file::read(path)?, path)
+    }
+
+    /// Checks a text that stands in a robot file. Profiles that are files are looked for from there.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, FileError> {
+        let RobotText { name, wheels, odometry_noise, sensor, mounting } =
+            toml_file::deserialize(text, path)?;
+        let impossible = |(key, reason)| FileError::Impossible { path: path.to_owned(), key, reason };
+        wheels.as_ref().map_or(Ok(()), Wheels::check).map_err(impossible)?;
+        mounting.check().map_err(impossible)?;
+        let mut profile_files = Vec::new();
+        Ok(Self {
+            name,
+            wheels,
+            odometry_noise: odometry_noise.complete(path, &mut profile_files)?,
+            sensor: sensor.complete(path, &mut profile_files)?,
+            mounting,
+            usual: false,
+            profile_files,
+        })
     }
 
     /// The robot that a format's logs were recorded with, built in: `robots/mines.toml`, `robots/sick.toml`, or
@@ -212,44 +171,8 @@ impl Robot {
             "simulated" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
             _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
         };
-        let robot: Self = toml_file::parse(text, Path::new(name)).expect("the built-in robots are tested");
+        let robot = Self::parse(text, Path::new(name)).expect("the built-in robots are tested");
         Self { usual: true, ..robot }
-    }
-
-    fn check_sensor(&self) -> Result<(), Impossible> {
-        let s = &self.sensor;
-        if s.max_range_mm <= s.min_range_mm {
-            let reason = format!("{} is not above min_range_mm = {}", s.max_range_mm, s.min_range_mm);
-            return Err(("sensor.max_range_mm".into(), reason));
-        }
-        if s.max_range_mm > u32::from(u16::MAX) {
-            return Err(("sensor.max_range_mm".into(), format!("{} is above 65535", s.max_range_mm)));
-        }
-        if s.no_echo_mm.len() > 2 {
-            return Err((
-                "sensor.no_echo_mm".into(),
-                format!("{} intervals, at most 2 are possible", s.no_echo_mm.len()),
-            ));
-        }
-        if let Some([from, to]) = s.no_echo_mm.iter().find(|[from, to]| from > to) {
-            return Err(("sensor.no_echo_mm".into(), format!("interval [{from}, {to}] is empty")));
-        }
-        positive("sensor.sigma_m", s.sigma_m)?;
-        not_negative("sensor.sigma_per_m", s.sigma_per_m)?;
-        positive("sensor.sigma_bearing_deg", s.sigma_bearing_deg)?;
-        positive("sensor.line_sigma_m", s.line_sigma_m)?;
-        if !(-10.0..=10.0).contains(&s.scan_delay_s) {
-            return Err(("sensor.scan_delay_s".into(), format!("{} is not within ±10 s", s.scan_delay_s)));
-        }
-        match (&s.steps, &s.field) {
-            (Some(steps), None) => steps.check(),
-            (None, Some(field)) if field.of_view_deg > 0.0 && field.of_view_deg <= 360.0 => Ok(()),
-            (None, Some(field)) => Err((
-                "sensor.field.of_view_deg".into(),
-                format!("{} is not within 0 to 360", field.of_view_deg),
-            )),
-            _ => Err(("sensor".into(), "needs either [sensor.steps] or [sensor.field]".into())),
-        }
     }
 
     /// Wheel geometry for the core.
@@ -277,15 +200,7 @@ impl Robot {
 
     /// Puts this robot into a configuration, for scans of this layout.
     pub fn apply(&self, config: &mut SlamConfig, layout: &ScanLayout<'_>) {
-        let n = &self.odometry_noise;
-        config.odometry.noise = OdometryNoise {
-            sigma_along_m_per_sqrt_m: n.along_m_per_sqrt_m,
-            sigma_across_m_per_sqrt_m: n.across_m_per_sqrt_m,
-            sigma_heading_rad_per_sqrt_m: n.heading_deg_per_sqrt_m.to_radians(),
-            sigma_heading_rad_per_sqrt_rad: n.heading_deg_per_sqrt_turn_deg * 1f32.to_radians().sqrt(),
-            sigma_position_floor_m: n.position_floor_m,
-            sigma_heading_floor_rad: n.heading_floor_deg.to_radians(),
-        };
+        config.odometry.noise = self.odometry_noise.core();
         config.line_noise.sigma_offset_m = self.sensor.line_sigma_m;
         config.sensor = self.sensor_for(layout);
     }
@@ -346,52 +261,79 @@ impl Robot {
     }
 }
 
-impl Sensor {
-    fn codes(&self) -> RangeCodes {
-        let saturated = |mm: u32| mm.min(u32::from(u16::MAX)) as u16;
-        let mut no_echo_mm = [(1, 0); 2];
-        for (code, [from, to]) in no_echo_mm.iter_mut().zip(&self.no_echo_mm) {
-            *code = (saturated(*from), saturated(*to));
-        }
-        RangeCodes { min_mm: saturated(self.min_range_mm), max_mm: saturated(self.max_range_mm), no_echo_mm }
-    }
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-impl Steps {
-    fn geometry(&self) -> ScanGeometry {
-        ScanGeometry {
-            first_step: self.first,
-            last_step: self.last,
-            front_step: self.front,
-            steps_per_revolution: self.per_revolution,
-            revolution_us: (self.revolution_s * 1e6).round() as u32,
+    const MINES: &str = include_str!("../../robots/mines.toml");
+
+    fn parse(changes: &[(&str, &str)], path: &Path) -> Result<Robot, String> {
+        let mut text = MINES.to_owned();
+        for (from, to) in changes {
+            assert!(text.contains(from), "'{from}' is not in mines.toml");
+            text = text.replacen(from, to, 1);
         }
+        Robot::parse(&text, path).map_err(|error| match &error {
+            FileError::Parse { source, .. } => format!("{error}: {source}"),
+            _ => error.to_string(),
+        })
     }
 
-    fn check(&self) -> Result<(), Impossible> {
-        positive("sensor.steps.per_revolution", self.per_revolution)?;
-        if self.last <= self.first {
-            return Err((
-                "sensor.steps.last".into(),
-                format!("{} is not above first = {}", self.last, self.first),
-            ));
+    #[test]
+    fn the_robots_differ_in_geometry_alone() {
+        let [mines, paper] = ["mines", "simulated"].map(|format| Robot::usual_for(format).config());
+        assert_eq!(mines.odometry.noise, paper.odometry.noise);
+        assert_eq!(mines.sensor.noise, paper.sensor.noise);
+        assert_eq!(mines.sensor.codes, paper.sensor.codes);
+        assert_eq!(mines.sensor.geometry, paper.sensor.geometry);
+        assert_eq!(mines.line_noise, paper.line_noise);
+        assert_eq!((mines.sensor.used_steps, paper.sensor.used_steps), ((114, 655), (44, 725)));
+    }
+
+    #[test]
+    fn a_robot_file_goes_before_its_profile() {
+        let path = Path::new("robots/rover.toml");
+        let robot = parse(&[("[sensor.steps]", "sigma_m = 0.5\n[sensor.steps]\nlast = 700")], path).unwrap();
+        let config = robot.config();
+        assert_eq!((config.sensor.noise.sigma_m, config.sensor.geometry.last_step), (0.5, 700));
+        assert_eq!(config.sensor.geometry.front_step, 384);
+        let field = ("[sensor.steps]\n", "[sensor.field]\nof_view_deg = 90.0\n");
+        let used = ("used = [114, 655]\n", "");
+        assert_eq!(
+            parse(&[field, used], path).unwrap().beams(),
+            None,
+            "a field replaces the profile's steps"
+        );
+    }
+
+    #[test]
+    fn profiles_that_cannot_be_used_are_named() {
+        let folder = std::env::temp_dir().join(format!("lineslam-profiles-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join("rover.toml");
+        let own = crate::profile::SENSORS[0].2.replace("sigma_m = 0.01", "sigma_m = 0.03");
+        std::fs::write(folder.join("own.toml"), &own).unwrap();
+        std::fs::write(folder.join("bad.toml"), own.replace("last = 725", "last = 4")).unwrap();
+        std::fs::write(folder.join("delay.toml"), format!("scan_delay_s = 0.1\n{own}")).unwrap();
+        let named = |name: &str| parse(&[("\"urg-04lx\"", &format!("\"{name}\""))], &path);
+        let robot = named("own.toml").unwrap();
+        assert_eq!(robot.config().sensor.noise.sigma_m, 0.03);
+        assert_eq!(robot.profile_files, [folder.join("own.toml")]);
+        for (name, words) in [
+            ("urg-05", &["rover.toml: sensor.profile", "urg-05", "urg-04lx, "][..]),
+            ("absent.toml", &["rover.toml: sensor.profile", "absent.toml"]),
+            ("bad.toml", &["bad.toml: steps.last", "4 is not above"]),
+            ("delay.toml", &["delay.toml: scan_delay_s"]),
+        ] {
+            let said = named(name).unwrap_err();
+            assert!(words.iter().all(|word| said.contains(word)), "{words:?} are not in: {said}");
         }
-        if f32::from(self.last - self.first) > self.per_revolution {
-            return Err(("sensor.steps.last".into(), "the steps are more than a revolution".into()));
-        }
-        if !(0.0..=10.0).contains(&self.revolution_s) {
-            return Err((
-                "sensor.steps.revolution_s".into(),
-                format!("{} is not within 0 to 10 s", self.revolution_s),
-            ));
-        }
-        let [from, to] = self.used;
-        if from > to || from < self.first || to > self.last {
-            return Err((
-                "sensor.steps.used".into(),
-                format!("[{from}, {to}] is not within the steps of the sensor"),
-            ));
-        }
-        Ok(())
+        let said = parse(&[("used = [114, 655]", "used = [114, 655]\nfrist = 3")], &path).unwrap_err();
+        assert!(said.contains("frist") && said.contains("rover.toml"), "{said}");
+        let said = parse(&[("used = [114, 655]", "used = [114, 800]")], &path).unwrap_err();
+        assert!(said.contains("rover.toml: sensor.steps.used"), "{said}");
+        let said = parse(&[("\"two-wheels\"", "\"three-wheels\"")], &path).unwrap_err();
+        assert!(said.contains("rover.toml: odometry_noise.profile"), "{said}");
+        std::fs::remove_dir_all(&folder).unwrap();
     }
 }

@@ -56,14 +56,19 @@ pub fn read(path: &Path) -> Result<String, FileError> {
 
 /// Checks a text that stands in a file.
 pub fn parse<T: Checked>(text: &str, path: &Path) -> Result<T, FileError> {
-    let described: T = toml::from_str(text)
-        .map_err(|source| FileError::Parse { path: path.to_owned(), source: Box::new(source) })?;
+    let described: T = deserialize(text, path)?;
     described.check().map_err(|(key, reason)| FileError::Impossible {
         path: path.to_owned(),
         key,
         reason,
     })?;
     Ok(described)
+}
+
+/// What a text in a file says, unchecked.
+pub fn deserialize<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileError> {
+    toml::from_str(text)
+        .map_err(|source| FileError::Parse { path: path.to_owned(), source: Box::new(source) })
 }
 
 /// A number of either width, which prints as it was written.
