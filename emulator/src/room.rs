@@ -2,9 +2,9 @@
 
 use lineslam::robot::Robot;
 use lineslam::sim::base::Base;
-use lineslam::sim::scanner::Scanner;
+use lineslam::sim::scanner::{Moment, Scanner};
 use lineslam::sim::world::World;
-use lineslam::sim::{SimConfig, interpolate, streams};
+use lineslam::sim::{SimConfig, config, interpolate};
 use nalgebra::Isometry2;
 use rigless::device::Level;
 use scip::sim::{Mode, SimulatedUrg, rates_agree};
@@ -41,7 +41,6 @@ pub struct Building {
     world: World,
     base: Base,
     scanner: Scanner,
-    base_from_laser: Isometry2<f64>,
     beam_us: f64,
     first_beam_us: f64,
     /// Pose at each step so far, one ahead of now.
@@ -68,14 +67,14 @@ impl Building {
         let mut wheels =
             robot.wheels.ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
         wheels.counter_bits = 32;
-        let config = robot.config();
-        let geometry = config.sensor.geometry;
+        let geometry = robot.config().sensor.geometry;
         let beam_us = f64::from(geometry.revolution_us) / f64::from(geometry.steps_per_revolution);
-        let [base_rng, scanner_rng] = streams(seed);
-        let base = Base::new(&world.path, wheels, &sim.wheel, base_rng);
+        // Counters begin again when the board is reset; the encoders' lines know nothing of that.
+        let mut sim = *sim;
+        sim.fault.restart_at_s = config::NEVER_S;
+        let base = Base::new(&world.path, wheels, &sim, seed);
         Ok(Self {
-            scanner: Scanner::new(&world, sim.sensor, geometry, scanner_rng),
-            base_from_laser: nalgebra::convert(config.sensor.mounting.base_from_laser),
+            scanner: Scanner::new(&world, robot, &sim, seed),
             beam_us,
             first_beam_us: f64::from(geometry.first_step) * beam_us,
             path_m: path_length(&world),
@@ -135,10 +134,9 @@ impl Building {
         let middle_us = at(0).midpoint(at(ranges_mm.len() - 1));
         let people = self.world.people_at(middle_us * 1e-6);
         let poses = &self.poses;
-        let base_from_laser = self.base_from_laser;
-        let measured = self
-            .scanner
-            .scan(|beam| interpolate(poses, at(beam) / STEP_US as f64) * base_from_laser, &people);
+        let moment = Moment { time_s: middle_us * 1e-6, carried: self.base.is_carried() };
+        let pose = |beam| interpolate(poses, at(beam) / STEP_US as f64);
+        let measured = self.scanner.scan(pose, &people, moment);
         ranges_mm.copy_from_slice(&measured);
         let world_from_base = self.pose_at_us(middle_us);
         self.scans.push(TrueScan { middle_us: middle_us as u64, world_from_base, ranges_mm: measured });

@@ -185,9 +185,8 @@ pub fn simulated(name: &'static str, world: &World, condition: usize, seed: u64)
     let (mut paper, mut paper_calibrated) = (None, None);
     if condition == 0 {
         paper = Some(measure(&drive, SlamConfig::paper())?.0);
-        let slip_m_per_sqrt_m = errors.wheel.slip_m_per_sqrt_m;
         errors.wheel =
-            WheelModel { radius_error: 0.0, radius_difference: 0.0, track_error: 0.0, slip_m_per_sqrt_m };
+            WheelModel { radius_error: 0.0, radius_difference: 0.0, track_error: 0.0, ..errors.wheel };
         let calibrated = sim::drive(world, &robot, &errors, seed)?;
         paper_calibrated = Some(measure(&calibrated, SlamConfig::paper())?.0);
     }

@@ -14,7 +14,7 @@ use crate::replay::Replay;
 use crate::robot::Robot;
 use crate::sim::judge::{self, Judgement, TrajectoryErrors};
 use crate::sim::world::World;
-use crate::sim::{Drive, SimConfig};
+use crate::sim::{Drive, SimConfig, UnitErrors};
 
 /// Everything the file says.
 #[derive(Debug, Serialize)]
@@ -65,6 +65,8 @@ pub struct SimulationReport {
     pub seed: u64,
     /// Errors of the simulated robot.
     pub errors: SimConfig,
+    /// What was wrong with this unit.
+    pub unit: UnitErrors,
     /// Measures of map and trajectory.
     #[serde(flatten)]
     pub judgement: Judgement,
@@ -80,6 +82,7 @@ impl SimulationReport {
             world: world.name.clone(),
             seed,
             errors,
+            unit: drive.unit,
             judgement: judge::judge(world, drive, replay),
             dead_reckoning: judge::trajectory_errors(&drive.truth, &odometry),
         }

@@ -2,12 +2,16 @@
 
 use nalgebra::{Isometry2, Point2, Vector2};
 use rand::RngExt;
-use rand_distr::{Distribution, Normal};
 use rand_pcg::Pcg64;
 use slam_core::scan::ScanGeometry;
 
-use super::SensorModel;
-use super::world::{Disc, Edge, World};
+use super::bias::Bias;
+use super::config::{SensorModel, SimConfig};
+use super::streams::{Stream, gauss, stream};
+use super::surfaces::{self, RoundSurface, Surface};
+use super::tilt::{Floor, Tilt};
+use super::world::{Disc, Edge, Finish, Sill, World};
+use crate::robot::Robot;
 
 /// Farthest distance the sensor reports, metres.
 pub const REACH_M: f64 = 5.6;
@@ -16,80 +20,215 @@ const ERROR_CODES: [u16; 4] = [1, 7, 8, 19];
 /// Neighbouring ranges farther apart than this have an edge between them, metres.
 const EDGE_M: f64 = 0.1;
 
+/// Glass is seen where the cosine between beam and normal is above this: 4°.
+const GLASS_SEEN: f64 = 0.9976;
+/// Shiny surfaces may be seen so much less flat than others.
+const SHINY: f64 = 3.0;
+/// Through windows there is so much more speckle.
+const WINDOW_SPECKLE: f64 = 10.0;
+/// Accuracy of a scanner whose profile states none: a URG-04LX's.
+const USUAL_ACCURACY: [f64; 2] = [0.01, 0.01];
+
 /// The simulated scanner.
 pub struct Scanner {
     model: SensorModel,
     geometry: ScanGeometry,
-    edges: Vec<Edge>,
-    discs: Vec<Disc>,
+    base_from_laser: Isometry2<f64>,
+    surfaces: Vec<Surface>,
+    round: Vec<RoundSurface>,
+    sills: Vec<Sill>,
+    bias: Bias,
     rng: Pcg64,
+    speckle: Pcg64,
 }
 
 /// What a ray met.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Distance, metres.
     pub range_m: f64,
     /// Cosine of the angle between beam and surface normal.
     pub incidence: f64,
-    /// Whether it gives no echo.
+    /// Whether it is glass.
     pub glass: bool,
 }
 
+/// What a beam met, and what that is like.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Met {
+    hit: Hit,
+    finish: Finish,
+}
+
+/// What a beam met on its way.
+#[derive(Clone, Copy, Debug, Default)]
+struct Seen {
+    met: Option<Met>,
+    through_glass: bool,
+}
+
+/// The instant of a scan.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Moment {
+    /// Time since power-up, seconds.
+    pub time_s: f64,
+    /// Whether the robot is in somebody's hands.
+    pub carried: bool,
+}
+
 impl Scanner {
-    /// A scanner in a world. `rng` decides all its noise.
-    pub fn new(world: &World, model: SensorModel, geometry: ScanGeometry, rng: Pcg64) -> Self {
-        Self { model, geometry, edges: world.edges(), discs: world.discs(), rng }
+    /// A robot's scanner in a world. The seed decides its bias and all its noise.
+    pub fn new(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Self {
+        let sensor = robot.config().sensor;
+        Self {
+            model: sim.sensor,
+            geometry: sensor.geometry,
+            base_from_laser: nalgebra::convert(sensor.mounting.base_from_laser),
+            surfaces: surfaces::as_built(world, &sim.wall, seed),
+            round: surfaces::round(world),
+            sills: world.sills.clone(),
+            bias: Bias::new(&sim.sensor, robot.sensor.accuracy.unwrap_or(USUAL_ACCURACY), seed),
+            rng: stream(seed, Stream::Scanner),
+            speckle: stream(seed, Stream::Speckle),
+        }
     }
 
-    /// One scan. `world_from_laser` gives the sensor's pose at a beam, `people` those who walk, at the middle beam.
-    pub fn scan(&mut self, world_from_laser: impl Fn(usize) -> Isometry2<f64>, people: &[Disc]) -> Vec<u16> {
+    /// The factor that fits best between true ranges and this unit's.
+    pub fn range_scale(&self) -> f64 {
+        self.bias.range_scale(REACH_M)
+    }
+
+    /// One scan. `world_from_base` gives the robot's pose at a beam, `people` those who walk, at the middle beam.
+    pub fn scan(
+        &mut self,
+        world_from_base: impl Fn(usize) -> Isometry2<f64>,
+        people: &[Disc],
+        moment: Moment,
+    ) -> Vec<u16> {
         let beams = self.geometry.beams();
-        let middle = Point2::from(world_from_laser(beams / 2).translation.vector);
+        let base = world_from_base(beams / 2);
+        let middle = Point2::from((base * self.base_from_laser).translation.vector);
         // What no beam can reach is left out beforehand.
-        let near_edge = |e: &&Edge| distance_to(e, middle) < REACH_M + 0.5;
-        let near_disc = |d: &&Disc| (d.centre - middle).norm() < REACH_M + 0.5 + d.radius;
-        let edges: Vec<Edge> = self.edges.iter().filter(near_edge).copied().collect();
-        let discs: Vec<Disc> = self.discs.iter().chain(people).filter(near_disc).copied().collect();
-        let hits: Vec<Option<Hit>> = (0..beams)
+        let near_edge = |s: &&Surface| distance_to(&s.edge, middle) < REACH_M + 0.5;
+        let near_disc = |s: &RoundSurface| (s.disc.centre - middle).norm() < REACH_M + 0.5 + s.disc.radius;
+        let surfaces: Vec<Surface> = self.surfaces.iter().filter(near_edge).copied().collect();
+        let people = people.iter().map(|disc| RoundSurface { disc: *disc, finish: Finish::Plain });
+        let round: Vec<RoundSurface> = self.round.iter().copied().chain(people).filter(near_disc).collect();
+        let level = moment.carried || self.model.tilt == 0.0 || !Tilt::possible(&self.sills, &base);
+        let seen: Vec<Seen> = (0..beams)
             .map(|beam| {
-                let pose = world_from_laser(beam);
+                let base = world_from_base(beam);
+                let pose = base * self.base_from_laser;
                 let bearing = f64::from(self.geometry.bearing(beam));
                 let direction = pose.rotation * Vector2::new(libm::cos(bearing), libm::sin(bearing));
-                cast(pose.translation.vector.into(), direction, &edges, &discs)
+                let seen = self.look(pose.translation.vector.into(), direction, &surfaces, &round);
+                let tilt = match (moment.carried, level) {
+                    (true, _) => Tilt::CARRIED,
+                    (false, true) => return seen,
+                    (false, false) => Tilt::on(&self.sills, &base).times(self.model.tilt),
+                };
+                let in_base = base.rotation.inverse() * direction;
+                seen.with_floor(tilt.floor_m(self.model.height_m, &in_base))
             })
             .collect();
-        (0..beams).map(|beam| self.reading(&hits, beam)).collect()
+        (0..beams).map(|beam| self.reading(&seen, beam, moment.time_s)).collect()
     }
 
-    fn reading(&mut self, hits: &[Option<Hit>], beam: usize) -> u16 {
+    /// What a ray meets. Glass that a real beam passes is left behind.
+    fn look(
+        &self,
+        from: Point2<f64>,
+        direction: Vector2<f64>,
+        surfaces: &[Surface],
+        round: &[RoundSurface],
+    ) -> Seen {
+        let transparent = self.model.glass_through > 0.5;
+        let (mut best, mut pane): (Option<Met>, Option<f64>) = (None, None);
+        let mut offer = |range_m: f64, incidence: f64, finish: Finish| {
+            if range_m <= 1e-3 {
+                return;
+            }
+            let glass = finish == Finish::Glass;
+            if glass && transparent && incidence < GLASS_SEEN {
+                pane = Some(pane.map_or(range_m, |pane| pane.min(range_m)));
+            } else if best.is_none_or(|best| range_m < best.hit.range_m) {
+                best = Some(Met { hit: Hit { range_m, incidence, glass: glass && !transparent }, finish });
+            }
+        };
+        for surface in surfaces {
+            if let Some((range_m, incidence)) = meet_edge(from, direction, &surface.edge) {
+                offer(range_m, incidence, surface.finish);
+            }
+        }
+        for surface in round {
+            if let Some((range_m, incidence)) = meet_disc(from, direction, &surface.disc) {
+                offer(range_m, incidence, surface.finish);
+            }
+        }
+        let through_glass = pane.is_some_and(|pane| best.is_none_or(|best| pane < best.hit.range_m));
+        Seen { met: best, through_glass }
+    }
+
+    fn reading(&mut self, seen: &[Seen], beam: usize, time_s: f64) -> u16 {
         // Drawn for every beam, so that a change of one model does not move the noise of the others.
-        let noise: f64 = Normal::new(0.0, 1.0).map_or(0.0, |n| n.sample(&mut self.rng));
+        let noise: f64 = gauss(&mut self.rng);
         let uniform: f64 = self.rng.random_range(-1.0..1.0);
         let (lost, mixed, share): (f64, f64, f64) = (self.rng.random(), self.rng.random(), self.rng.random());
         let code = ERROR_CODES[self.rng.random_range(0..ERROR_CODES.len())];
-        let Some(hit) = hits[beam].as_ref().filter(|h| !h.glass) else { return 0 };
+        let (speckle, nonsense): (f64, f64) = (self.speckle.random(), self.speckle.random());
+        let window = if seen[beam].through_glass { WINDOW_SPECKLE } else { 1.0 };
+        if speckle < self.model.speckle * window {
+            return in_mm(nonsense * REACH_M);
+        }
+        let Some(met) = seen[beam].met.filter(|met| !met.hit.glass) else { return 0 };
         if lost < self.model.dropout {
             return code;
         }
+        let hit = met.hit;
+        if met.finish == Finish::Dark && hit.range_m > self.model.dark_reach_m {
+            return 0;
+        }
         // A surface almost along the beam returns too little.
-        if hit.incidence < self.model.least_incidence {
+        let flattest = if met.finish == Finish::Shiny { SHINY } else { 1.0 } * self.model.least_incidence;
+        if hit.incidence < flattest {
             return code;
         }
         let mut range_m = hit.range_m;
         if mixed < self.model.mixed_pixels
-            && let Some(Some(next)) = hits.get(beam + 1)
-            && (next.range_m - hit.range_m).abs() > EDGE_M
-            && !next.glass
+            && let Some(next) = seen.get(beam + 1).and_then(|seen| seen.met)
+            && (next.hit.range_m - hit.range_m).abs() > EDGE_M
+            && !next.hit.glass
         {
-            range_m += share * (next.range_m - hit.range_m);
+            range_m += share * (next.hit.range_m - hit.range_m);
         }
         let sigma_m = self.model.sigma_m.max(self.model.sigma_per_m * range_m);
+        let bias_m = self.bias.at(range_m, hit.incidence, met.finish, time_s);
         range_m += sigma_m * noise + self.model.uniform_m * uniform;
+        range_m += bias_m;
         if range_m > REACH_M {
             return 0;
         }
-        (range_m * 1000.0).round().clamp(20.0, 5600.0) as u16
+        in_mm(range_m)
     }
+}
+
+impl Seen {
+    /// What is seen where the floor, or nothing, comes first.
+    fn with_floor(self, floor: Floor) -> Self {
+        match floor {
+            Floor::Beyond => self,
+            Floor::Over => Self { met: None, through_glass: false },
+            Floor::At(range_m) if self.met.is_none_or(|met| range_m < met.hit.range_m) => {
+                let hit = Hit { range_m, incidence: 1.0, glass: false };
+                Self { met: Some(Met { hit, finish: Finish::Plain }), through_glass: false }
+            }
+            Floor::At(_) => self,
+        }
+    }
+}
+
+fn in_mm(range_m: f64) -> u16 {
+    (range_m * 1000.0).round().clamp(20.0, 5600.0) as u16
 }
 
 /// Distance of a point from an edge, metres.
@@ -101,35 +240,39 @@ pub fn distance_to(edge: &Edge, point: Point2<f64>) -> f64 {
 
 /// The first surface a ray meets.
 pub fn cast(from: Point2<f64>, direction: Vector2<f64>, edges: &[Edge], discs: &[Disc]) -> Option<Hit> {
-    let mut best: Option<Hit> = None;
-    let mut offer = |range_m: f64, incidence: f64, glass: bool| {
-        if range_m > 1e-3 && best.as_ref().is_none_or(|b| range_m < b.range_m) {
-            best = Some(Hit { range_m, incidence, glass });
-        }
-    };
-    for edge in edges {
-        let (along, to_edge) = (edge.to - edge.from, edge.from - from);
-        let denominator = direction.perp(&along);
-        let share = to_edge.perp(&direction) / denominator;
-        if (0.0..=1.0).contains(&share) {
-            offer(to_edge.perp(&along) / denominator, denominator.abs() / along.norm(), edge.glass);
-        }
-    }
-    for disc in discs {
-        let to_centre = disc.centre - from;
-        let (ahead, aside) = (to_centre.dot(&direction), to_centre.perp(&direction));
-        let half2 = disc.radius * disc.radius - aside * aside;
-        if half2 > 0.0 {
-            let half = half2.sqrt();
-            offer(ahead - half, half / disc.radius, false);
-        }
-    }
-    best
+    let of_edge = |e: &Edge| Some((meet_edge(from, direction, e)?, e.glass));
+    let of_disc = |d: &Disc| Some((meet_disc(from, direction, d)?, false));
+    edges
+        .iter()
+        .filter_map(of_edge)
+        .chain(discs.iter().filter_map(of_disc))
+        .map(|((range_m, incidence), glass)| Hit { range_m, incidence, glass })
+        .filter(|hit| hit.range_m > 1e-3)
+        .min_by(|a, b| a.range_m.total_cmp(&b.range_m))
+}
+
+/// Range and cosine of the incidence at which a ray's line meets an edge; a range below zero lies behind.
+fn meet_edge(from: Point2<f64>, direction: Vector2<f64>, edge: &Edge) -> Option<(f64, f64)> {
+    let (along, to_edge) = (edge.to - edge.from, edge.from - from);
+    let denominator = direction.perp(&along);
+    let share = to_edge.perp(&direction) / denominator;
+    (0.0..=1.0)
+        .contains(&share)
+        .then(|| (to_edge.perp(&along) / denominator, denominator.abs() / along.norm()))
+}
+
+/// The same of a disc, where the ray enters it.
+fn meet_disc(from: Point2<f64>, direction: Vector2<f64>, disc: &Disc) -> Option<(f64, f64)> {
+    let to_centre = disc.centre - from;
+    let (ahead, aside) = (to_centre.dot(&direction), to_centre.perp(&direction));
+    let half2 = disc.radius * disc.radius - aside * aside;
+    (half2 > 0.0).then(|| (ahead - half2.sqrt(), half2.sqrt() / disc.radius))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sim::SimKind;
 
     #[test]
     fn a_ray_meets_the_nearest_surface() {
@@ -143,5 +286,82 @@ mod tests {
         assert!((slanted.incidence - 3.0 / 9.81f64.sqrt()).abs() < 1e-12);
         assert!(hit(-Vector2::x(), &[disc]).is_none());
         assert!(hit(Vector2::y(), &[disc]).is_none());
+    }
+
+    /// Two hundred readings straight ahead of a robot before the things of a world.
+    fn ahead(things: &str, sim: &SimConfig, heading_deg: f64) -> Vec<u16> {
+        let text = format!(
+            "name = \"t\"\n{things}\n[path]\nheading_deg = 0\nspeed = 0.3\npoints = [[0, 0], [1, 0]]\n"
+        );
+        let world: World = crate::toml_file::parse(&text, std::path::Path::new("t.toml")).unwrap();
+        let robot = Robot::usual_for("simulated");
+        let mut scanner = Scanner::new(&world, &robot, sim, 3);
+        let pose = Isometry2::new(Vector2::zeros(), heading_deg.to_radians());
+        (0..200).map(|_| scanner.scan(|_| pose, &[], Moment { time_s: 1e6, carried: false })[340]).collect()
+    }
+
+    fn median(mut readings: Vec<u16>) -> u16 {
+        readings.sort_unstable();
+        readings[readings.len() / 2]
+    }
+
+    /// A pane 2 m before the scanner, a wall behind it.
+    const WINDOW: &str = "[[wall]]\nglass = true\npoints = [[2.14, -3], [2.14, 3]]\n[[wall]]\npoints = [[4.14, -5], [4.14, 5]]";
+
+    #[test]
+    fn glass_is_seen_through_except_at_right_angles() {
+        let real = SimConfig::of(SimKind::Real);
+        let through = median(ahead(WINDOW, &real, 15.0));
+        // The scanner sits 0.14 m ahead: 4.14 m less that, along the slant.
+        let expected = 1000.0 * (4.14 - 0.14 * 15f64.to_radians().cos()) / 15f64.to_radians().cos();
+        assert!((f64::from(through) - expected).abs() < 80.0, "{through} mm, not {expected}");
+        let square = median(ahead(WINDOW, &real, 0.0));
+        assert!((i32::from(square) - 2000).abs() < 60, "{square} mm");
+        for heading_deg in [0.0, 15.0] {
+            assert!(
+                ahead(WINDOW, &SimConfig::default(), heading_deg).iter().all(|mm| *mm == 0),
+                "ideal glass"
+            );
+        }
+    }
+
+    #[test]
+    fn dark_surfaces_return_nothing_from_afar() {
+        let wall = |x: f64| format!("[[wall]]\nfinish = \"dark\"\npoints = [[{x}, -3], [{x}, 3]]");
+        let real = SimConfig::of(SimKind::Real);
+        assert!((i32::from(median(ahead(&wall(1.94), &real, 0.0))) - 1800).abs() < 60);
+        assert_eq!(median(ahead(&wall(2.44), &real, 0.0)), 0);
+        assert!((i32::from(median(ahead(&wall(2.44), &SimConfig::default(), 0.0))) - 2300).abs() < 60);
+    }
+
+    #[test]
+    fn sunlight_speckles_through_windows() {
+        let mut sim = SimConfig::default();
+        sim.set("sensor.speckle=0.02").unwrap();
+        sim.set("sensor.glass_through=1").unwrap();
+        let wall = "[[wall]]\npoints = [[4.14, -5], [4.14, 5]]";
+        let odd = |things: &str| {
+            let readings = ahead(things, &sim, 15.0);
+            readings.iter().filter(|mm| **mm > 20 && (i32::from(**mm) - 4145).abs() > 300).count()
+        };
+        let (plain, window) = (odd(wall), odd(WINDOW));
+        assert!(plain < 15 && (20..70).contains(&window), "{plain} and {window} of 200");
+    }
+
+    #[test]
+    fn beams_hit_the_floor_on_a_sill() {
+        let sill = |x: f64| {
+            format!(
+                "[[wall]]\npoints = [[5.14, -5], [5.14, 5]]\n[[sill]]\nfrom = [{x}, -1]\nto = [{x}, 1]\nheight = 0.015"
+            )
+        };
+        let real = SimConfig::of(SimKind::Real);
+        // The caster, 0.15 m behind the axle, is on it: the nose points down by 0.1, the floor is 2 m off.
+        let floor = median(ahead(&sill(-0.15), &real, 0.0));
+        assert!((1900..2100).contains(&floor), "{floor} mm");
+        for level in [ahead(&sill(-0.6), &real, 0.0), ahead(&sill(-0.15), &SimConfig::default(), 0.0)] {
+            let wall = median(level);
+            assert!((4850..5150).contains(&wall), "{wall} mm");
+        }
     }
 }

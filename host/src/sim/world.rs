@@ -25,6 +25,18 @@ pub struct World {
     /// Chairs and tables, of which the scanner sees four legs.
     #[serde(default, rename = "legs")]
     pub legs: Vec<Legs>,
+    /// Radiators before walls.
+    #[serde(default, rename = "radiator")]
+    pub radiators: Vec<Radiator>,
+    /// Curtains.
+    #[serde(default, rename = "curtain")]
+    pub curtains: Vec<Curtain>,
+    /// Frames of doors.
+    #[serde(default, rename = "door")]
+    pub doors: Vec<Door>,
+    /// Sills over which the robot tilts.
+    #[serde(default, rename = "sill")]
+    pub sills: Vec<Sill>,
     /// People on their way.
     #[serde(default, rename = "person")]
     pub people: Vec<Person>,
@@ -44,10 +56,15 @@ pub struct Wall {
     /// Whether the last point joins the first.
     #[serde(default)]
     pub closed: bool,
-    /// Glass: the scanner sees nothing of it, nor beyond.
+    /// Glass: an ideal scanner sees nothing of it, nor beyond; a real one sees through, except at right angles.
     #[serde(default)]
     pub glass: bool,
+    /// What its surface is like.
+    #[serde(default)]
+    pub finish: Finish,
 }
+
+pub use super::things::{Curtain, Door, Finish, Radiator, Sill};
 
 /// A thing with a rectangular outline.
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -60,6 +77,9 @@ pub struct Cuboid {
     /// Turn, degrees.
     #[serde(default)]
     pub yaw_deg: f64,
+    /// What its surface is like.
+    #[serde(default)]
+    pub finish: Finish,
 }
 
 /// A thing with a round outline.
@@ -70,6 +90,9 @@ pub struct Pillar {
     pub centre: [f64; 2],
     /// Its radius.
     pub radius: f64,
+    /// What its surface is like.
+    #[serde(default)]
+    pub finish: Finish,
 }
 
 /// Four round legs at the corners of a rectangle.
@@ -85,6 +108,9 @@ pub struct Legs {
     pub yaw_deg: f64,
     /// Radius of a leg.
     pub radius: f64,
+    /// What they are like.
+    #[serde(default)]
+    pub finish: Finish,
 }
 
 /// A person walking to and fro on a polyline.
@@ -184,6 +210,7 @@ impl Checked for World {
                 return Err((format!("person {}", i + 1), "has fewer than two way points".into()));
             }
         }
+        self.check_things()?;
         finite("path.points", &self.path.points)?;
         positive("path.speed", self.path.speed)?;
         not_negative("path.pause_s", self.path.pause_s)?;
@@ -208,23 +235,30 @@ impl World {
 
     /// Every straight surface.
     pub fn edges(&self) -> Vec<Edge> {
+        self.finished_edges().into_iter().map(|(edge, _)| edge).collect()
+    }
+
+    /// The same, with what they are like: those of walls first.
+    pub fn finished_edges(&self) -> Vec<(Edge, Finish)> {
         let mut edges = self.wall_edges();
         for b in &self.boxes {
             let c = rectangle(b.centre, b.size, b.yaw_deg);
-            edges.extend((0..4).map(|i| Edge { from: c[i], to: c[(i + 1) % 4], glass: false }));
+            edges.extend((0..4).map(|i| (Edge { from: c[i], to: c[(i + 1) % 4], glass: false }, b.finish)));
         }
+        edges.extend(self.thing_edges());
         edges
     }
 
-    fn wall_edges(&self) -> Vec<Edge> {
+    /// Straight surfaces of walls.
+    pub fn wall_edges(&self) -> Vec<(Edge, Finish)> {
         let mut edges = Vec::new();
         for wall in &self.walls {
             let n = wall.points.len();
             let pieces = if wall.closed { n } else { n - 1 };
-            edges.extend((0..pieces).map(|i| Edge {
-                from: wall.points[i].into(),
-                to: wall.points[(i + 1) % n].into(),
-                glass: wall.glass,
+            let finish = if wall.glass { Finish::Glass } else { wall.finish };
+            edges.extend((0..pieces).map(|i| {
+                let (from, to) = (wall.points[i].into(), wall.points[(i + 1) % n].into());
+                (Edge { from, to, glass: finish == Finish::Glass }, finish)
             }));
         }
         edges
@@ -232,12 +266,16 @@ impl World {
 
     /// Every round surface that stays where it is.
     pub fn discs(&self) -> Vec<Disc> {
-        let mut discs: Vec<Disc> =
-            self.pillars.iter().map(|p| Disc { centre: p.centre.into(), radius: p.radius }).collect();
+        self.finished_discs().into_iter().map(|(disc, _)| disc).collect()
+    }
+
+    /// The same, with what they are like.
+    pub fn finished_discs(&self) -> Vec<(Disc, Finish)> {
+        let pillar = |p: &Pillar| (Disc { centre: p.centre.into(), radius: p.radius }, p.finish);
+        let mut discs: Vec<(Disc, Finish)> = self.pillars.iter().map(pillar).collect();
         for l in &self.legs {
-            discs.extend(
-                rectangle(l.centre, l.size, l.yaw_deg).map(|centre| Disc { centre, radius: l.radius }),
-            );
+            let leg = |centre| (Disc { centre, radius: l.radius }, l.finish);
+            discs.extend(rectangle(l.centre, l.size, l.yaw_deg).map(leg));
         }
         discs
     }
@@ -245,7 +283,7 @@ impl World {
     /// Unit directions, away from a point, of the walls that end there.
     pub fn directions_at(&self, point: Point2<f64>) -> Vec<Vector2<f64>> {
         let mut directions = Vec::new();
-        for edge in self.wall_edges() {
+        for (edge, _) in self.wall_edges() {
             for (end, other) in [(edge.from, edge.to), (edge.to, edge.from)] {
                 if (end - point).norm() < 1e-6 {
                     directions.push((other - end).normalize());
