@@ -190,7 +190,10 @@ pub fn calibrate(
         let kept = if parameter.told { parameter.value } else { parameter.before };
         set_number(&mut document, parameter.key, kept);
     }
-    // What was written must be a robot file too.
+    // What was written must be a robot file too, wherever it will lie.
+    for table in ["sensor", "odometry_noise"] {
+        set_absolute_profile(&mut document, table, robot_path);
+    }
     Robot::parse(&document.to_string(), robot_path)?;
     Ok(Calibration { parameters, windows: now.windows, robot_file: document.to_string() })
 }
@@ -198,6 +201,16 @@ pub fn calibrate(
 fn number_in(document: &DocumentMut, [table, key]: [&str; 2]) -> f64 {
     let item = &document[table][key];
     item.as_float().or_else(|| item.as_integer().map(|v| v as f64)).unwrap_or(0.0)
+}
+
+/// Names a profile that is a file in such a way that it is found from everywhere.
+fn set_absolute_profile(document: &mut DocumentMut, table: &str, robot_path: &Path) {
+    let Some(item) = document.get_mut(table).and_then(|table| table.get_mut("profile")) else { return };
+    let Some(name) = item.as_str().filter(|name| name.ends_with(".toml")) else { return };
+    let path = robot_path.parent().unwrap_or(Path::new("")).join(name);
+    if let Ok(path) = path.canonicalize() {
+        *item = value(path.to_string_lossy().into_owned());
+    }
 }
 
 /// Sets a number to six digits, the comment beside it kept.

@@ -110,7 +110,12 @@ fn the_command_writes_a_robot_file_and_keeps_its_comments() {
     let world = World::load(&root().join("worlds/hall_quarter.toml")).unwrap();
     let drive = drive(&world, &Robot::usual_for("simulated"), &SimConfig::default(), 3).unwrap();
     std::fs::write(&log, lineslam::log::plain_text(&drive.log, &Robot::usual_for("simulated"))).unwrap();
-    let output = command(&log, &wrong_file(folder.path()), &out);
+    let wrong = wrong_file(folder.path());
+    let own = std::fs::read_to_string(root().join("sensors/urg-04lx.toml")).unwrap();
+    std::fs::write(folder.path().join("own.toml"), own).unwrap();
+    let text = std::fs::read_to_string(&wrong).unwrap().replace("\"urg-04lx\"", "\"own.toml\"");
+    std::fs::write(&wrong, text).unwrap();
+    let output = command(&log, &wrong, &out);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert!(String::from_utf8_lossy(&output.stdout).contains("wheels.track_m"));
     Robot::load(&out).unwrap();

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use lineslam::log::{self, Odometry, ReadOptions};
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
-use lineslam::sim::{SimConfig, drive};
+use lineslam::sim::{SimConfig, SimKind, drive};
 
 fn worlds() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../worlds")
@@ -48,6 +48,108 @@ fn every_world_is_good_and_its_path_is_driven_to_the_end() {
         });
         assert!(clearance.fold(f64::INFINITY, f64::min) > 0.1, "{}", path.display());
     }
+}
+
+/// The robot's radius is 0.2 m, and neither slip nor a caster's kick takes it off its way.
+#[test]
+fn in_furnished_worlds_the_robot_keeps_clear_of_everything() {
+    for (name, corners) in [("lab", 9), ("flat", 14), ("loop", 14), ("twins", 11)] {
+        let world = world(&format!("{name}.toml"));
+        assert_eq!(world.corners.len(), corners);
+        let (edges, discs) = (world.edges(), world.discs());
+        for kind in SimKind::ALL {
+            let drive = drive(&world, &robot(), &SimConfig::of(kind), 1).unwrap();
+            for pose in &drive.truth {
+                let at = nalgebra::Point2::from(pose.translation.vector);
+                let edge = edges.iter().map(|e| lineslam::sim::scanner::distance_to(e, at));
+                let disc = discs.iter().map(|d| (d.centre - at).norm() - d.radius);
+                let clear = edge.chain(disc).fold(f64::INFINITY, f64::min);
+                assert!(clear > 0.2, "{name}: {clear:.2} m from something at {at}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_twins_are_alike() {
+    let world = world("twins.toml");
+    let inside = |x: f64| {
+        let edges = world.edges().into_iter().flat_map(|e| [e.from, e.to]);
+        let points = edges.chain(world.discs().into_iter().map(|d| d.centre));
+        let near = points.filter(|p| p.y > 2.05 && (x..x + 4.3).contains(&p.x));
+        let mut inside: Vec<[i64; 2]> =
+            near.map(|p| [((p.x - x) * 1e3).round() as i64, (p.y * 1e3).round() as i64]).collect();
+        inside.sort_unstable();
+        inside
+    };
+    assert!(inside(1.4).len() > 40);
+    assert_eq!(inside(1.4), inside(8.4));
+}
+
+/// What a real robot's log is like, on the numbers of exp1 and exp3: 43 % of the beams without echo, 3 % error codes, nine ranges in
+/// ten below 3.5 m, stamps 69 to 136 ms apart.
+#[test]
+fn a_real_lab_is_like_the_recorded_one() {
+    let drive = drive(&world("lab.toml"), &robot(), &SimConfig::of(SimKind::Real), 5).unwrap();
+    // The outer 70 beams of the recorded logs see the rover.
+    let mut ranges: Vec<u16> = drive.log.scans.iter().flat_map(|s| s.ranges_mm[70..612].to_vec()).collect();
+    ranges.sort_unstable();
+    let share = |most: u16| ranges.partition_point(|mm| *mm <= most) as f64 / ranges.len() as f64;
+    assert!((0.35..0.5).contains(&share(0)), "{} without echo", share(0));
+    assert!((0.02..0.05).contains(&(share(19) - share(0))), "{} error codes", share(19) - share(0));
+    let seen = &ranges[ranges.partition_point(|mm| *mm < 20)..];
+    assert!((3000..4000).contains(&seen[seen.len() * 9 / 10]), "{}", seen[seen.len() * 9 / 10]);
+    let mut apart: Vec<u64> = drive.log.scans.windows(2).map(|w| w[1].stamp_us - w[0].stamp_us).collect();
+    apart.sort_unstable();
+    let at = |share: f64| apart[(apart.len() as f64 * share) as usize] / 1000;
+    assert!((60..80).contains(&at(0.05)) && (95..105).contains(&at(0.5)) && (120..145).contains(&at(0.95)));
+}
+
+#[test]
+fn a_lifted_robot_is_put_down_elsewhere_and_its_wheels_stand_still() {
+    let world = world("hall_quarter.toml");
+    let mut config = SimConfig::default();
+    for setting in ["fault.lift_at_s=10", "fault.lift_by_m=3", "wheel.slip_m_per_sqrt_m=0"] {
+        config.set(setting).unwrap();
+    }
+    let lifted = drive(&world, &robot(), &config, 1).unwrap();
+    let at =
+        |time_s: f64| lifted.log.scans.iter().position(|s| s.stamp_us as f64 * 1e-6 - 1.0 > time_s).unwrap();
+    let (before, after) = (at(10.1), at(12.9));
+    assert_eq!(lifted.log.odometry[before].1, lifted.log.odometry[after].1);
+    let way = (lifted.truth[at(13.1)].translation.vector - lifted.truth[at(9.9)].translation.vector).norm();
+    assert!((2.8..3.2).contains(&way), "{way} m");
+    let end = lifted.truth.last().unwrap().translation.vector;
+    let [x, y] = *world.path.points.last().unwrap();
+    assert!(
+        (end - nalgebra::Vector2::new(x, y)).norm() < 0.25,
+        "it drives on to its goal, and ends at {end}"
+    );
+}
+
+/// Each error has random numbers of its own: a clock that jitters moves no wheel, a bias no speckle.
+#[test]
+fn turning_an_error_off_does_not_move_the_others() {
+    let world = world("hall_quarter.toml");
+    let driven = |settings: &[&str]| {
+        let mut config = SimConfig::of(SimKind::Real);
+        settings.iter().for_each(|setting| config.set(setting).unwrap());
+        drive(&world, &robot(), &config, 6).unwrap()
+    };
+    let all = driven(&[]);
+    let no_bias = driven(&["sensor.bias=0", "sensor.speckle=0"]);
+    assert_eq!((&all.truth, &all.log.odometry), (&no_bias.truth, &no_bias.log.odometry));
+    let unmoved = |a: u16, b: u16| a.abs_diff(b) <= 90 || a <= 20 || b <= 20;
+    let pairs = all.log.scans.iter().zip(&no_bias.log.scans);
+    let (mut moved, mut count) = (0, 0);
+    for (a, b) in pairs.flat_map(|(a, b)| a.ranges_mm.iter().zip(&b.ranges_mm)) {
+        moved += usize::from(!unmoved(*a, *b));
+        count += 1;
+    }
+    assert!((moved as f64) < 0.005 * f64::from(count), "{moved} of {count} moved by more than bias");
+    assert_eq!(no_bias.unit.range_scale, 1.0);
+    assert!(all.unit.range_scale != 1.0 && (all.unit.range_scale - 1.0).abs() <= 0.01);
+    assert_eq!(all.unit.radius_scale, no_bias.unit.radius_scale);
 }
 
 #[test]

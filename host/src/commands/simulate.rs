@@ -38,7 +38,7 @@ pub struct Args {
     /// Change an error of that kind: wheel.radius_error, wheel.radius_difference, wheel.track_error,
     /// wheel.slip_m_per_sqrt_m, wheel.turn_slip, wheel.start_slip_share, wheel.start_slip_deg, wheel.spins_per_min,
     /// wheel.spin_m, wheel.caster_kick_deg, sensor.sigma_m, sensor.sigma_per_m, sensor.uniform_m, sensor.dropout,
-    /// sensor.mixed_pixels, sensor.least_incidence, sensor.skip_every, sensor.delay_s, sensor.bias, sensor.warm_up_m,
+    /// sensor.mixed_pixels, sensor.least_incidence, sensor.edge_loss, sensor.fade_m, sensor.skip_every, sensor.delay_s, sensor.bias, sensor.warm_up_m,
     /// sensor.warm_up_s, sensor.dark_reach_m, sensor.glass_through, sensor.speckle, sensor.tilt, sensor.height_m,
     /// clock.revolution, clock.jitter_s, clock.hiccups, clock.offset_s, wall.bow_m, wall.skirting_m. Or have something
     /// happen: fault.spin_left_at_s, fault.spin_right_at_s (with spin_s, spin_m_s), fault.lift_at_s (lift_s, lift_by_m,

@@ -20,6 +20,10 @@ const ERROR_CODES: [u16; 4] = [1, 7, 8, 19];
 /// Neighbouring ranges farther apart than this have an edge between them, metres.
 const EDGE_M: f64 = 0.1;
 
+/// The code of a reading whose neighbours are in error.
+const EDGE_CODE: u16 = 7;
+/// Scatter of the reach on ordinary surfaces, which are not all alike.
+const FADE_SIGMA: f64 = 0.2;
 /// Glass is seen where the cosine between beam and normal is above this: 4°.
 const GLASS_SEEN: f64 = 0.9976;
 /// Shiny surfaces may be seen so much less flat than others.
@@ -40,6 +44,7 @@ pub struct Scanner {
     bias: Bias,
     rng: Pcg64,
     speckle: Pcg64,
+    weak: Pcg64,
 }
 
 /// What a ray met.
@@ -90,6 +95,7 @@ impl Scanner {
             bias: Bias::new(&sim.sensor, robot.sensor.accuracy.unwrap_or(USUAL_ACCURACY), seed),
             rng: stream(seed, Stream::Scanner),
             speckle: stream(seed, Stream::Speckle),
+            weak: stream(seed, Stream::Weak),
         }
     }
 
@@ -185,8 +191,8 @@ impl Scanner {
             return code;
         }
         let hit = met.hit;
-        if met.finish == Finish::Dark && hit.range_m > self.model.dark_reach_m {
-            return 0;
+        if let Some(code) = self.weak(seen, beam, &met) {
+            return code;
         }
         // A surface almost along the beam returns too little.
         let flattest = if met.finish == Finish::Shiny { SHINY } else { 1.0 } * self.model.least_incidence;
@@ -209,6 +215,29 @@ impl Scanner {
             return 0;
         }
         in_mm(range_m)
+    }
+}
+
+impl Scanner {
+    /// What is read where too little light comes back, or that of two surfaces.
+    fn weak(&mut self, seen: &[Seen], beam: usize, met: &Met) -> Option<u16> {
+        let (reach, edge, code) =
+            (gauss(&mut self.weak), self.weak.random::<f64>(), self.weak.random::<f64>());
+        let Hit { range_m, incidence, .. } = met.hit;
+        let reach_m = match met.finish {
+            Finish::Dark => self.model.dark_reach_m,
+            // Light that comes back goes with cosine and inverse square.
+            _ => self.model.fade_m * incidence.sqrt() * (1.0 + FADE_SIGMA * reach),
+        };
+        if range_m > reach_m {
+            return Some(0);
+        }
+        let apart = |other: Option<&Seen>| {
+            let other_m = other.and_then(|seen| seen.met).map_or(f64::INFINITY, |met| met.hit.range_m);
+            (other_m - range_m).abs() > EDGE_M
+        };
+        let at_edge = apart(beam.checked_sub(1).and_then(|k| seen.get(k))) || apart(seen.get(beam + 1));
+        (at_edge && edge < self.model.edge_loss).then_some(if code < 0.5 { 0 } else { EDGE_CODE })
     }
 }
 
@@ -310,7 +339,8 @@ mod tests {
 
     #[test]
     fn glass_is_seen_through_except_at_right_angles() {
-        let real = SimConfig::of(SimKind::Real);
+        let mut real = SimConfig::of(SimKind::Real);
+        real.set("sensor.fade_m=1000").unwrap();
         let through = median(ahead(WINDOW, &real, 15.0));
         // The scanner sits 0.14 m ahead: 4.14 m less that, along the slant.
         let expected = 1000.0 * (4.14 - 0.14 * 15f64.to_radians().cos()) / 15f64.to_radians().cos();
@@ -335,6 +365,26 @@ mod tests {
     }
 
     #[test]
+    fn returns_fade_with_range_and_slant_and_at_edges() {
+        let mut sim = SimConfig::default();
+        sim.set("sensor.fade_m=4.5").unwrap();
+        let wall = |x: f64| format!("[[wall]]\npoints = [[{x}, -9], [{x}, 9]]");
+        let none = |things: &str, sim: &SimConfig, deg| {
+            ahead(things, sim, deg).iter().filter(|mm| **mm == 0).count()
+        };
+        let [near, far] = [2.14, 4.64].map(|x| none(&wall(x), &sim, 0.0));
+        assert!(near < 10 && (60..140).contains(&far), "{near} and {far} of 200");
+        let slanted = none(&wall(2.14), &sim, 60.0);
+        assert!(slanted > 120, "{slanted} of 200 at 4 m and 60°");
+        // A leg as wide as one beam.
+        sim = SimConfig::default();
+        sim.set("sensor.edge_loss=0.6").unwrap();
+        let leg = "[[pillar]]\ncentre = [2.14, 0]\nradius = 0.008";
+        let lost = ahead(leg, &sim, 0.0).iter().filter(|mm| **mm <= 20).count();
+        assert!((100..145).contains(&lost), "{lost} of 200");
+    }
+
+    #[test]
     fn sunlight_speckles_through_windows() {
         let mut sim = SimConfig::default();
         sim.set("sensor.speckle=0.02").unwrap();
@@ -355,7 +405,8 @@ mod tests {
                 "[[wall]]\npoints = [[5.14, -5], [5.14, 5]]\n[[sill]]\nfrom = [{x}, -1]\nto = [{x}, 1]\nheight = 0.015"
             )
         };
-        let real = SimConfig::of(SimKind::Real);
+        let mut real = SimConfig::of(SimKind::Real);
+        real.set("sensor.fade_m=1000").unwrap();
         // The caster, 0.15 m behind the axle, is on it: the nose points down by 0.1, the floor is 2 m off.
         let floor = median(ahead(&sill(-0.15), &real, 0.0));
         assert!((1900..2100).contains(&floor), "{floor} mm");

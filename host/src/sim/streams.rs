@@ -24,6 +24,8 @@ pub enum Stream {
     WarmUp,
     /// Speckle.
     Speckle,
+    /// Returns that are too weak.
+    Weak,
     /// Wandering of the motor.
     Motor,
     /// Jitter of the stamps.
