@@ -15,7 +15,9 @@ pub mod config;
 pub mod encoders;
 pub mod fixed_set;
 pub mod judge;
+pub mod rays;
 pub mod scanner;
+pub mod settings;
 pub mod slip;
 pub mod streams;
 pub mod surfaces;
@@ -23,9 +25,8 @@ pub mod things;
 pub mod tilt;
 pub mod world;
 
-pub use config::{
-    BadSetting, ClockModel, FaultModel, SensorModel, SimConfig, SimKind, WallModel, WheelModel,
-};
+pub use config::{ClockModel, FaultModel, SensorModel, SimConfig, SimKind, WallModel, WheelModel};
+pub use settings::BadSetting;
 
 use nalgebra::Isometry2;
 use serde::Serialize;
