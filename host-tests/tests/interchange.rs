@@ -12,7 +12,6 @@ use lineslam::replay::{self, Replay};
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
 use lineslam::sim::{self, Drive, SimConfig};
-use lineslam::toml_file;
 use serde_json::json;
 use slam_core::SlamConfig;
 
