@@ -8,7 +8,7 @@ use slam_core::scan::ScanGeometry;
 pub use super::rays::{Hit, cast, distance_to};
 
 use super::bias::Bias;
-use super::config::{SensorModel, SimConfig};
+use super::config::{NEVER_M, SensorModel, SimConfig};
 use super::rays::{meet_disc, meet_edge};
 use super::streams::{Stream, gauss, stream};
 use super::surfaces::{self, RoundSurface, Surface};
@@ -218,6 +218,7 @@ impl Scanner {
         let Hit { range_m, incidence, .. } = met.hit;
         let reach_m = match met.finish {
             Finish::Dark => self.model.dark_reach_m,
+            _ if self.model.fade_m >= NEVER_M => f64::INFINITY,
             // Light that comes back goes with cosine and inverse square.
             _ => self.model.fade_m * incidence.sqrt() * (1.0 + FADE_SIGMA * reach),
         };
