@@ -2,9 +2,9 @@
 
 use lineslam::log::{Log, LoggedScan, Odometry, plain_text};
 use lineslam::robot::Robot;
-use lineslam::sim::Drive;
 use lineslam::sim::judge::{self, TrajectoryErrors};
 use lineslam::sim::world::World;
+use lineslam::sim::{Drive, UnitErrors};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
 use slam_core::odometry::Integration;
@@ -82,6 +82,7 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
         log: Log { format: "emulated", ..Log::default() },
         truth: Vec::new(),
         true_wheels: ([0.0; 2], 0.0),
+        unit: UnitErrors::NONE,
     };
     let mut poses = Vec::new();
     let mut took: Vec<u32> = Vec::new();

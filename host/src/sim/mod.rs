@@ -72,6 +72,12 @@ pub struct UnitErrors {
     pub stamp_delay_s: f64,
 }
 
+impl UnitErrors {
+    /// A unit that is as its files say, and one of which nothing is known.
+    pub const NONE: Self =
+        Self { range_scale: 1.0, radius_scale: [1.0; 2], track_scale: 1.0, stamp_delay_s: 0.0 };
+}
+
 /// Drives the world's path once.
 pub fn drive(world: &World, robot: &Robot, sim: &SimConfig, seed: u64) -> Result<Drive, ReplayError> {
     let wheels = robot.wheels.ok_or_else(|| ReplayError::NoWheels { robot: robot.name.clone() })?;
