@@ -2,7 +2,7 @@
 //!
 //! Everything urgent runs above this in interrupts: a long update delays no byte and no tick.
 
-use core::sync::atomic::{AtomicBool, Ordering};
+use core::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use embassy_futures::select::{Either, select};
 use embassy_stm32::peripherals::IWDG;
@@ -11,6 +11,8 @@ use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Receiver;
 use embassy_time::{Duration, Instant, Ticker};
 use slam_core::pose::components;
+use slam_core::tracking::TrackingState;
+use slam_core::wheel_faults::WheelFault;
 
 use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;
@@ -30,6 +32,8 @@ const STATUS_EVERY: Duration = Duration::from_secs(1);
 /// Segments of the map that are printed at once.
 const PRINT_AT_ONCE: usize = 8;
 
+/// The [`TrackingState`], for the LED.
+pub static TRACKING: AtomicU8 = AtomicU8::new(TrackingState::Tracking as u8);
 /// Set to have the map printed.
 pub static PRINT_MAP: AtomicBool = AtomicBool::new(false);
 
@@ -84,6 +88,10 @@ struct Mapping {
     printing: Option<usize>,
     coasting: bool,
     dropped: u32,
+    /// As they were said last.
+    state: TrackingState,
+    fault: Option<WheelFault>,
+    restarts: u32,
 }
 
 impl Mapping {
@@ -98,6 +106,9 @@ impl Mapping {
             printing: None,
             coasting: false,
             dropped: 0,
+            state: TrackingState::Tracking,
+            fault: None,
+            restarts: 0,
         }
     }
 
@@ -155,7 +166,32 @@ impl Mapping {
                 }
             }
         }
+        self.report_tracking();
         CONSOLE.signal(PoseLine::new(scan.middle_us, &self.keeper.mapper().slam().pose()));
+    }
+
+    /// What has changed of the state, and of what is known of the wheels.
+    fn report_tracking(&mut self) {
+        let mapper = self.keeper.mapper();
+        let (state, fault) = (mapper.slam().state(), mapper.slam().wheel_fault());
+        let restarts = mapper.counters().counters_restarted;
+        if core::mem::replace(&mut self.state, state) != state {
+            TRACKING.store(state as u8, Ordering::Relaxed);
+            match state {
+                TrackingState::Tracking => defmt::info!("tracking again"),
+                TrackingState::Uncertain => defmt::warn!("the pose is uncertain"),
+                TrackingState::Lost => defmt::warn!("the robot is lost: nothing enters the map"),
+            }
+        }
+        if core::mem::replace(&mut self.fault, fault) != fault {
+            match fault {
+                Some(fault) => defmt::warn!("{=str}", fault.message()),
+                None => defmt::info!("the wheels are as they should be again"),
+            }
+        }
+        if core::mem::replace(&mut self.restarts, restarts) != restarts {
+            defmt::warn!("the counters restarted");
+        }
     }
 
     fn coast(&mut self) {

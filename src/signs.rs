@@ -1,12 +1,15 @@
-//! LED and button: a short flash while scans come, a slow blink while they do not; the button prints the map.
+//! LED and button: a short flash a second while scans come and the pose is to be relied on, two a second while it is uncertain,
+//! fast blinking while the robot is lost, a slow blink while no scans come; the button prints the map.
 
 use core::sync::atomic::Ordering;
 
 use embassy_stm32::gpio::{Input, Output};
 use embassy_time::Timer;
 
+use slam_core::tracking::TrackingState;
+
 use crate::lidar::STATE;
-use crate::mapping::PRINT_MAP;
+use crate::mapping::{PRINT_MAP, TRACKING};
 
 /// The button is looked at so often; it is quiet by then.
 const LOOK_MS: u64 = 20;
@@ -16,7 +19,13 @@ const LOOK_MS: u64 = 20;
 pub async fn run(mut led: Output<'static>, button: Input<'static>) {
     let mut was_pressed = false;
     for step in (0u32..).cycle() {
-        let (period, on) = if STATE.present.load(Ordering::Relaxed) { (50, 3) } else { (100, 50) };
+        let state = TRACKING.load(Ordering::Relaxed);
+        let (period, on) = match STATE.present.load(Ordering::Relaxed) {
+            false => (100, 50),
+            true if state == TrackingState::Lost as u8 => (10, 5),
+            true if state == TrackingState::Uncertain as u8 => (25, 3),
+            true => (50, 3),
+        };
         if step % period < on {
             led.set_high();
         } else {

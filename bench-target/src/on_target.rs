@@ -93,6 +93,8 @@ fn scan_motion(motion: &Motion) -> ScanMotion {
             turn_rad: motion.turn_rad,
         },
         middle_from_knot: motion.sweep.map(at),
+        // The odometry of the drive is good: nothing is made up for it.
+        sweep_share: 0.0,
     }
 }
 

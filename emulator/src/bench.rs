@@ -23,7 +23,7 @@ const GRID_US: u64 = 1000;
 const LONGEST_US: u64 = 3_600_000_000;
 
 /// Instructions that a scan may take with the default configuration and [`BUDGET_SEGMENTS`] segments: median and 99th percentile.
-const BUDGET: [u32; 2] = [250_000, 500_000];
+const BUDGET: [u32; 2] = [200_000, 600_000];
 const BUDGET_SEGMENTS: usize = 200;
 /// Between two scans.
 const SCAN_S: f64 = 0.1;

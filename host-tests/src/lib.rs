@@ -35,15 +35,17 @@ pub fn lineslam() -> &'static Path {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     BUILT.get_or_init(|| {
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        // Beside the folder of the tests' own programs, and as they were built.
+        let test = std::env::current_exe().expect("a test has a path");
+        let folder = test.parent().and_then(Path::parent).expect("tests lie in deps/");
+        let release = folder.ends_with("release").then_some("--release");
         let status = Command::new(cargo)
             .args(["build", "--quiet", "-p", "lineslam", "--bin", "lineslam"])
+            .args(release)
             .current_dir(root())
             .status()
             .expect("cargo runs");
         assert!(status.success(), "lineslam cannot be built");
-        // Beside the folder of the tests' own programs.
-        let test = std::env::current_exe().expect("a test has a path");
-        let folder = test.parent().and_then(Path::parent).expect("tests lie in deps/");
         folder.join(format!("lineslam{}", std::env::consts::EXE_SUFFIX))
     })
 }

@@ -16,6 +16,7 @@ use std::path::Path;
 use nalgebra::{Isometry2, SMatrix, SVector, Vector2, Vector3};
 use slam_core::SlamConfig;
 use slam_core::correction::Verdict;
+use slam_core::wheel_faults::WheelFault;
 use toml_edit::{DocumentMut, value};
 
 use crate::log::{Log, Odometry};
@@ -88,6 +89,12 @@ pub enum CalibrationError {
     /// No ticks.
     #[error("the log brings poses, not wheel ticks or angles: there is nothing to calibrate")]
     NoTicks,
+    /// Wheels or encoders are not as the robot file says.
+    #[error("{}: mend it, or the robot file, before calibrating; nothing is written", fault.message())]
+    WheelFault {
+        /// What is wrong.
+        fault: WheelFault,
+    },
     /// Hardly any window in which the scanner's motion is known.
     #[error(
         "the scanner's motion is known in {windows} windows of {WINDOW} scans, {LEAST_WINDOWS} are needed: \
@@ -305,6 +312,13 @@ impl Window {
 fn windows(log: &Log, robot: &Robot, p: &Vector) -> Result<Vec<Window>, CalibrationError> {
     let looser = Robot { odometry_noise: robot.odometry_noise.times(DISTRUST), ..robot.clone() };
     let replay = replay::run(log, &looser, SlamConfig::default(), || {})?;
+    // For most of the drive, or at its end: some seconds of slip are no fault.
+    let faults = || replay.steps.iter().filter_map(|step| step.update.wheel_fault);
+    if let Some(fault) = replay.steps.last().and_then(|step| step.update.wheel_fault).or(faults().next_back())
+        && 4 * faults().filter(|f| *f == fault).count() > replay.steps.len()
+    {
+        return Err(CalibrationError::WheelFault { fault });
+    }
     let base_from_laser = Isometry2::new(Vector2::new(p[4], p[5]), p[6]);
     let laser = |step: &Step| nalgebra::convert::<_, Isometry2<f64>>(step.pose) * base_from_laser;
     let plain = |step: &Step| {

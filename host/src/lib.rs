@@ -5,6 +5,7 @@
 pub mod beams;
 pub mod benchmark;
 pub mod calibrate;
+pub mod configuration;
 pub mod experiments;
 pub mod log;
 pub mod output;

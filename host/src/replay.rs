@@ -98,6 +98,8 @@ pub struct Replay {
     pub distance_m: f64,
     /// Steps of the odometry that no robot can make; they were taken as none.
     pub impossible_steps: usize,
+    /// When both counters had been restarted, microseconds.
+    pub restarts_us: Vec<u64>,
     /// The robot.
     pub robot: Robot,
 }
@@ -191,6 +193,7 @@ fn run_sized<const BEAMS: usize>(
         config,
         distance_m,
         impossible_steps: feed.impossible_steps,
+        restarts_us: feed.restarts_us,
         robot: robot.clone(),
     })
 }
@@ -209,6 +212,7 @@ struct OdometryFeed<'a> {
     /// Samples fed since then.
     since: usize,
     impossible_steps: usize,
+    restarts_us: Vec<u64>,
 }
 
 impl<'a> OdometryFeed<'a> {
@@ -228,6 +232,7 @@ impl<'a> OdometryFeed<'a> {
             carried: None,
             since: 0,
             impossible_steps: 0,
+            restarts_us: Vec::new(),
         })
     }
 
@@ -276,6 +281,19 @@ impl<'a> OdometryFeed<'a> {
 
     fn increment(&mut self, before: (u64, Odometry), after: (u64, Odometry)) -> Increment {
         let step = self.step(before.1, after.1);
+        if let (Odometry::Ticks(from), Odometry::Ticks(to), Some((wheels, drive))) =
+            (before.1, after.1, self.robot.wheels.zip(self.robot.drive()))
+        {
+            let possible = |ticks: [i32; 2]| drive.is_possible(ticks[0], ticks[1], after.0 - before.0);
+            if possible(wheels.ticks_between(from, to)) {
+                return step;
+            }
+            if possible(wheels.ticks_between([0, 0], to)) {
+                self.restarts_us.push(after.0 - STAMP_OFFSET_US);
+            }
+            self.impossible_steps += 1;
+            return Increment::identity();
+        }
         let most_m = LEAST_JUMP_M + MOST_SPEED * (after.0 - before.0) as f64 * 1e-6;
         if f64::from(step.distance_m) <= most_m {
             return step;

@@ -9,7 +9,7 @@ fn worlds() -> PathBuf {
 
 fn experiments(out: &Path, worlds: &Path) -> Output {
     Command::new(env!("CARGO_BIN_EXE_lineslam"))
-        .args(["experiments", "--seeds", "1", "--first-seed", "77", "--worlds"])
+        .args(["experiments", "--seeds", "1", "--first-seed", "77", "--ransac-seeds", "2", "--worlds"])
         .arg(worlds)
         .arg("--out")
         .arg(out)
@@ -23,14 +23,28 @@ fn the_page_has_its_tables_figures_and_command() {
     let output = experiments(folder.path(), &worlds());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let page = std::fs::read_to_string(folder.path().join("experiments.md")).unwrap();
-    assert!(page.contains("experiments --seeds 1 --first-seed 77\n"), "the command that wrote it");
+    assert!(
+        page.contains("experiments --seeds 1 --first-seed 77 --ransac-seeds 2\n"),
+        "the command that wrote it"
+    );
     assert!(page.contains("0.067") && page.contains("0.234"), "the paper's own figures");
     for condition in ["wheel errors doubled", "±30 mm", "10 %", "every fifth scan"] {
         assert!(page.contains(condition), "{condition}");
     }
     let images: Vec<&str> =
         page.split("](images/").skip(1).map(|rest| rest.split_once(')').unwrap().0).collect();
-    assert_eq!(images, ["hall.svg", "hall_dead_reckoning.svg", "corridor.svg", "office.svg"]);
+    let [paper, partial] = ["corridor_paper.svg", "corridor_paper-partial.svg"];
+    assert_eq!(images, ["hall.svg", "hall_dead_reckoning.svg", "corridor.svg", "office.svg", paper, partial]);
+    for configuration in ["paper", "paper-weighted", "paper-partial", "default"] {
+        for drives in ["calibrated wheels", "usual errors"] {
+            let is_row = |line: &&str| {
+                let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+                cells.get(2..4) == Some(&[drives, configuration])
+            };
+            // Of three buildings, in the table of the corners and in that of the trajectories.
+            assert_eq!(page.lines().filter(is_row).count(), 6, "{configuration}, {drives}");
+        }
+    }
     for image in images {
         let svg = std::fs::read_to_string(folder.path().join("images").join(image)).unwrap();
         assert!(svg.starts_with("<svg"), "{image}");

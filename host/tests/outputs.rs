@@ -67,21 +67,31 @@ fn a_run_writes_every_file_and_the_recording_where_it_is_asked_for() {
     assert_eq!(text("trajectory_final.tum").lines().count(), scans);
     let table = text("trajectory.csv");
     let header = "stamp_s,x_m,y_m,theta_rad,cov_xx_m2,cov_xy_m2,cov_xt_m_rad,cov_yy_m2,cov_yt_m_rad,cov_tt_rad2,\
-                  state,support,residual_m";
+                  state,fixed,odometry,support,residual_m";
     assert_eq!(table.lines().next(), Some(header));
     assert_eq!(table.lines().count(), scans + 1);
-    let mut states = BTreeMap::<&str, usize>::new();
+    let (mut states, mut fixed) = (BTreeMap::<&str, usize>::new(), BTreeMap::<&str, usize>::new());
     for (row, pose) in table.lines().skip(1).zip(text("trajectory.tum").lines()) {
-        *states.entry(row.split(',').nth(10).unwrap()).or_default() += 1;
+        let words: Vec<&str> = row.split(',').collect();
+        *states.entry(words[10]).or_default() += 1;
+        *fixed.entry(words[11]).or_default() += 1;
+        assert!(["used", "left_out", "useless"].contains(&words[12]), "{row}");
         let (row, pose) = (numbers(row, ','), numbers(pose, ' '));
         assert_eq!(row.len(), 12, "every number is one");
         assert!((0..3).all(|k| (row[k] - pose[k]).abs() < 1e-6), "{row:?} {pose:?}");
         assert!(row[4] > 0.0 && row[7] > 0.0 && row[9] > 0.0, "variances: {row:?}");
         assert!((0.0..=1.0).contains(&row[10]), "support: {row:?}");
     }
-    assert!(states["full"] > scans / 2, "{states:?}");
-    let known = ["full", "corridor", "blind", "uncorrected", "rejected"];
+    assert!(states["tracking"] > scans / 2 && fixed["full"] > scans / 2, "{states:?} {fixed:?}");
+    let known = ["tracking", "uncertain", "lost", "rejected"];
     assert!(states.keys().all(|state| known.contains(state)), "{states:?}");
+    let known = ["full", "corridor", "blind", "uncorrected"];
+    assert!(fixed.keys().all(|what| known.contains(what)), "{fixed:?}");
+    let report: serde_json::Value = serde_json::from_str(&text("report.json")).unwrap();
+    for state in ["tracking", "uncertain", "lost"] {
+        let counted = states.get(state).copied().unwrap_or_default();
+        assert_eq!(report["tracking"][state], counted, "{state}");
+    }
 
     let bytes = std::fs::read(&recording).unwrap();
     let mut topics = BTreeMap::<String, usize>::new();

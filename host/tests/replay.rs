@@ -395,12 +395,21 @@ fn the_scanner_of_a_log_with_several_is_chosen() {
 }
 
 #[test]
-fn both_configurations_run() {
+fn every_configuration_runs() {
     let bench = Bench::new();
     let log = bench.file("room.log", carmen_log(12).join("\n"));
-    assert!(bench.replay(&log, &["--config", "paper"]).status.success());
-    assert_eq!(bench.report()["configuration"], "paper");
-    assert!(bench.report()["config"]["extraction"]["ransac"].is_object());
+    for (name, weight, singular) in [
+        ("paper", "equal", "keep_pose"),
+        ("paper-weighted", "inliers", "keep_pose"),
+        ("paper-partial", "inliers", "correct_observed"),
+    ] {
+        assert!(bench.replay(&log, &["--config", name]).status.success());
+        let report = bench.report();
+        assert_eq!(report["configuration"], name);
+        assert!(report["config"]["extraction"]["ransac"].is_object());
+        assert_eq!(report["config"]["registration"]["end_points"]["weight"], weight, "{name}");
+        assert_eq!(report["config"]["correction"]["least_squares"]["singular"], singular, "{name}");
+    }
 }
 
 #[test]

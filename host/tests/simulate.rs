@@ -200,6 +200,14 @@ fn the_report_has_the_truth_s_word() {
     assert!(
         report["dead_reckoning"]["ate_rmse_m"].as_f64().unwrap() > report["ate_rmse_m"].as_f64().unwrap()
     );
+    // Each alignment leaves less than the one before.
+    let errors = ["unaligned_rmse_m", "ate_rmse_m", "scaled_rmse_m"].map(|key| report[key].as_f64().unwrap());
+    assert!(errors.is_sorted_by(|a, b| a >= b), "{errors:?}");
+    for laid in ["laid", "laid_with_scale"] {
+        let found = report[laid]["corners_found"].as_u64().unwrap();
+        assert!(found >= report["corners_found"].as_u64().unwrap(), "{laid}: {found}");
+        assert!((report[laid]["scale"].as_f64().unwrap() - 1.0).abs() < 0.02, "{laid}");
+    }
     assert_eq!(report["errors"]["sensor"]["dropout"], 0.05);
     assert_eq!(report["world"], "hall_quarter");
     let truth = std::fs::read_to_string(folder.path().join("truth.tum")).unwrap();

@@ -200,6 +200,7 @@ impl Robot {
 
     /// Puts this robot into a configuration, for scans of this layout.
     pub fn apply(&self, config: &mut SlamConfig, layout: &ScanLayout<'_>) {
+        config.odometry.track_m = self.wheels.map(|w| w.track_m);
         config.odometry.noise = self.odometry_noise.core();
         config.line_noise.sigma_offset_m = self.sensor.line_sigma_m;
         config.sensor = self.sensor_for(layout);

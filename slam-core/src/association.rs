@@ -13,6 +13,7 @@ use crate::extraction::MAX_SEGMENTS;
 use crate::map::MapSegment;
 use crate::math::{min, sqrt};
 use crate::nearby::Nearby;
+use crate::paper::bisector::{BisectorConfig, bisector_distance};
 use crate::pose::cross;
 use crate::residual::{LineNoise, Residual};
 use crate::segment::Segment;
@@ -26,15 +27,6 @@ pub enum AssociationConfig {
     Bisector(BisectorConfig),
     /// Gates on direction, distance and overlap; the likeliest of those within.
     Gated(GateConfig),
-}
-
-/// Settings of the paper's association.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct BisectorConfig {
-    /// Largest distance between the two crossings of the bisector, metres.
-    pub max_distance_m: f32,
 }
 
 /// Settings of the gated association.
@@ -92,6 +84,11 @@ const SERVES_M: f32 = 0.15;
 const SERVES_RAD: f32 = 0.05;
 
 impl Shortlist {
+    /// Nothing.
+    pub const fn new() -> Self {
+        Self { pairs: Vec::new(), at: None, complete: 0 }
+    }
+
     /// Nothing; to be called before each scan.
     pub fn clear(&mut self) {
         self.at = None;
@@ -208,19 +205,6 @@ fn pair_with_best(
         // One pair for each observed segment: the caller's capacities are the same.
         let _ = pairs.push(Pair { observed, mapped });
     }
-}
-
-/// Distance between the points in which the perpendicular bisector of `observed` crosses it and `mapped`, if it does
-/// cross `mapped` and the distance is within the threshold.
-fn bisector_distance(observed: &Segment, mapped: &Segment, config: &BisectorConfig) -> Option<f32> {
-    let midpoint = observed.midpoint();
-    let (bisector, along) = (observed.normal(), mapped.end - mapped.start);
-    let denominator = cross(along, bisector);
-    let from_start = midpoint - mapped.start;
-    // start + t·along = midpoint + s·bisector.
-    let t = cross(from_start, bisector) / denominator;
-    let s = cross(from_start, along) / denominator;
-    ((0.0..=1.0).contains(&t) && s.abs() <= config.max_distance_m).then_some(s.abs())
 }
 
 /// Whether a segment with this direction and centroid passes the gates on direction and distance.

@@ -3,7 +3,7 @@
 //! In: observed segments in `base`, their pairs in the map, the predicted pose with its covariance. Out: the corrected
 //! pose with covariance, and how well each direction of the pose is seen.
 //!
-//! [`least_squares`] is the paper's: equations (3)–(9), solved once, no prior; a singular system leaves the pose alone.
+//! The paper's is in [`least_squares`](mod@crate::paper::least_squares): solved once, no prior.
 //! [`maximum_a_posteriori`] is one Gauss-Newton step of the default: the odometry is a prior, each pair weighs by its
 //! lines' covariances, a robust kernel turns down pairs that do not fit, and information that is only an artefact of
 //! uncertain line directions is taken out (see [`Observability`]).
@@ -13,9 +13,11 @@ use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 use crate::association::Pair;
 use crate::map::MapSegment;
 use crate::math::{max, min, sqrt};
+use crate::paper::least_squares::LeastSquaresConfig;
 use crate::pose::{components, perpendicular, pose};
 use crate::residual::{LineNoise, Residual};
 use crate::segment::Segment;
+use crate::tracking::SearchConfig;
 
 /// How the pose is corrected.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,16 +25,16 @@ use crate::segment::Segment;
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
 pub enum CorrectionConfig {
     /// Equations (3)–(9) of the paper.
-    LeastSquares,
+    LeastSquares(LeastSquaresConfig),
     /// Maximum a posteriori, iterated with re-association.
-    MaximumAPosteriori(MapConfig),
+    MaximumAPosteriori(GaussNewtonConfig),
 }
 
 /// Settings of the maximum-a-posteriori correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct MapConfig {
+pub struct GaussNewtonConfig {
     /// Most rounds of association and step.
     pub max_iterations: u8,
     /// A step shorter than this ends the rounds, metres and radians alike.
@@ -50,25 +52,6 @@ pub struct MapConfig {
     /// Search for a better start.
     pub search: SearchConfig,
 }
-
-/// Settings of the search for another pose where little of a scan was recognised.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct SearchConfig {
-    /// The search is made when less than this share of the scan was recognised: pairs weighed otherwise, other headings.
-    pub below_support: f32,
-    /// Share of the scan that must be recognised more for another pose to be taken.
-    pub gain: f32,
-    /// Distance between the headings tried, radians.
-    pub step_rad: f32,
-    /// How far they reach to each side, radians.
-    pub reach_rad: f32,
-}
-
-/// The paper's system is called singular when its least eigenvalue is this share of its largest, or less (ours). Walls that are
-/// parallel but for the noise of their directions would otherwise fix the position along them.
-const SINGULAR_SHARE: f32 = 1e-3;
 
 /// Which directions of the pose the pairs fix.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -151,47 +134,6 @@ pub struct Standpoint<'a> {
     pub forgiven: Option<&'a Matrix3<f32>>,
 }
 
-/// Equations (3)–(9): one linear least-squares step on the end points of the observed segments.
-///
-/// `None` when the system is singular. The paper gives no covariance; here it is that of points of variance
-/// `variance_m2`, n of them for each segment.
-pub fn least_squares(
-    observed: &[Segment],
-    pairs: &[Pair],
-    map: &[MapSegment],
-    predicted: &Isometry2<f32>,
-    variance_m2: f32,
-) -> Option<Correction> {
-    let centre = predicted.translation.vector;
-    let (mut normal_matrix, mut right) = (Matrix3::<f32>::zeros(), Vector3::<f32>::zeros());
-    for pair in pairs {
-        let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get(pair.mapped)) else { continue };
-        let seen = seen.transformed(predicted);
-        let line = entry.segment.line();
-        let (u, n) = (line.normal, seen.moments.inliers as f32);
-        for p in [seen.start, seen.end] {
-            let turned = perpendicular(p.coords - centre).dot(&u); // M(p − c)·u
-            let gap = line.distance_m - p.coords.dot(&u); // b − p·u
-            let row = Vector3::new(u.x, u.y, turned);
-            normal_matrix += row * row.transpose() * n; // A, B, D
-            right += row * (n * gap); // E, F
-        }
-    }
-    // Eq. (9). The paper does not say when it calls a system singular.
-    let [least, _, most] = sorted_eigenvalues(&normal_matrix);
-    if least.is_nan() || least <= SINGULAR_SHARE * most {
-        return None;
-    }
-    let inverse = normal_matrix.cholesky()?.inverse();
-    let step = inverse * right;
-    let c = components(predicted);
-    let corrected = pose(c.x + step.x, c.y + step.y, c.z + step.z);
-    // Each point was counted at both ends.
-    let observability = judge(&(normal_matrix / (2.0 * variance_m2)), 0.0, f32::INFINITY);
-    let covariance = inverse * (2.0 * variance_m2);
-    finite(Correction { pose: corrected, covariance, step: largest(&step), observability })
-}
-
 /// One Gauss-Newton step towards the pose of largest posterior probability.
 ///
 /// `None` when the numbers do not allow a step (a prior that is not positive definite, infinities). Work: one step
@@ -203,7 +145,7 @@ pub fn maximum_a_posteriori(
     prior: &Prior,
     from: &Standpoint<'_>,
     line_noise: &LineNoise,
-    config: &MapConfig,
+    config: &GaussNewtonConfig,
 ) -> Option<Correction> {
     let (information, gradient) = pair_sums(observed, pairs, map, from, line_noise, config);
     let observability = judge(&information, config.direction_trust_rad, config.observable_sigma_m);
@@ -227,7 +169,7 @@ fn pair_sums(
     map: &[MapSegment],
     from: &Standpoint<'_>,
     line_noise: &LineNoise,
-    config: &MapConfig,
+    config: &GaussNewtonConfig,
 ) -> (Matrix3<f32>, Vector3<f32>) {
     let (mut information, mut gradient) = (Matrix3::zeros(), Vector3::zeros());
     let position = from.pose.translation.vector.into();
@@ -259,8 +201,12 @@ fn translation_information(information: &Matrix3<f32>) -> Matrix2<f32> {
     }
 }
 
-/// What a normal matrix says of each direction; see [`MapConfig`] for the two limits.
-fn judge(information: &Matrix3<f32>, direction_trust_rad: f32, observable_sigma_m: f32) -> Observability {
+/// What a normal matrix says of each direction; see [`GaussNewtonConfig`] for the two limits.
+pub(crate) fn judge(
+    information: &Matrix3<f32>,
+    direction_trust_rad: f32,
+    observable_sigma_m: f32,
+) -> Observability {
     let trace = information.trace();
     if !(trace > 0.0 && trace.is_finite()) {
         return Observability::BLIND;
@@ -298,11 +244,11 @@ fn sorted_eigenvalues(m: &Matrix3<f32>) -> [f32; 3] {
     [min(a, b), max(a, b), c]
 }
 
-fn largest(step: &Vector3<f32>) -> f32 {
+pub(crate) fn largest(step: &Vector3<f32>) -> f32 {
     max(max(step.x.abs(), step.y.abs()), step.z.abs())
 }
 
-fn finite(correction: Correction) -> Option<Correction> {
+pub(crate) fn finite(correction: Correction) -> Option<Correction> {
     let covariance_is_finite = correction.covariance.iter().all(|v| v.is_finite());
     (crate::pose::is_finite(&correction.pose) && covariance_is_finite).then_some(correction)
 }
@@ -310,6 +256,7 @@ fn finite(correction: Correction) -> Option<Correction> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::paper::fixtures::{all_pairs, entries, room, wall};
     use crate::segment::Moments;
     use nalgebra::Point2;
     use proptest::prelude::*;
@@ -317,38 +264,11 @@ mod tests {
 
     const NOISE: LineNoise = LineNoise { sigma_offset_m: 0.005, sigma_direction_rad: 0.002 };
 
-    fn config() -> MapConfig {
+    fn config() -> GaussNewtonConfig {
         match crate::SlamConfig::default().correction {
             CorrectionConfig::MaximumAPosteriori(config) => config,
-            CorrectionConfig::LeastSquares => unreachable!("the default is maximum a posteriori"),
+            CorrectionConfig::LeastSquares(_) => unreachable!("the default is maximum a posteriori"),
         }
-    }
-
-    fn wall(from: (f32, f32), to: (f32, f32), points: usize) -> Segment {
-        let at = |i: usize| {
-            let share = i as f32 / (points - 1) as f32;
-            Point2::new(from.0 + share * (to.0 - from.0), from.1 + share * (to.1 - from.1))
-        };
-        let moments = Moments::from_points((0..points).map(|i| (at(i), 1e4)));
-        Segment::fitted(moments, &[at(0), at(points - 1)], Point2::origin())
-    }
-
-    /// A room around the origin: every wall faces it.
-    fn room() -> Vec<Segment> {
-        [
-            wall((3.0, -2.0), (3.0, 2.5), 60),
-            wall((3.0, 2.5), (-2.0, 2.5), 70),
-            wall((-2.0, 2.5), (-2.0, -2.0), 50),
-            wall((-2.0, -2.0), (1.0, -2.0), 40),
-        ]
-        .to_vec()
-    }
-
-    fn entries(walls: &[Segment]) -> Vec<MapSegment> {
-        walls
-            .iter()
-            .map(|&segment| MapSegment { segment, hits: 5, seen_through: 0, last_seen: 1, seen_at_m: 0.0 })
-            .collect()
     }
 
     /// A step that forgives nothing.
@@ -363,62 +283,7 @@ mod tests {
         maximum_a_posteriori(observed, pairs, map, prior, &from, &NOISE, &config())
     }
 
-    fn all_pairs(n: usize) -> Vec<Pair> {
-        (0..n).map(|i| Pair { observed: i, mapped: i }).collect()
-    }
-
-    /// The same least squares in f64 over the end points, by numeric differentiation of the cost of eq. (3).
-    fn reference_step(observed: &[Segment], map: &[MapSegment], predicted: [f64; 3]) -> [f64; 3] {
-        let residuals = |d: [f64; 3]| {
-            let mut all = Vec::new();
-            for (seen, entry) in observed.iter().zip(map) {
-                let line = entry.segment.line();
-                let (ux, uy, b) =
-                    (f64::from(line.normal.x), f64::from(line.normal.y), f64::from(line.distance_m));
-                for end in [seen.start, seen.end] {
-                    let (s, c) = predicted[2].sin_cos();
-                    let (ex, ey) = (f64::from(end.x), f64::from(end.y));
-                    // p − c, then R(Δθ) made linear.
-                    let (px, py) = (c * ex - s * ey, s * ex + c * ey);
-                    let (qx, qy) =
-                        (px - d[2] * py + predicted[0] + d[0], py + d[2] * px + predicted[1] + d[1]);
-                    all.push(f64::from(seen.moments.inliers).sqrt() * (qx * ux + qy * uy - b));
-                }
-            }
-            nalgebra::SVector::<f64, 8>::from_iterator(all)
-        };
-        let at = residuals([0.0; 3]);
-        let h = 1e-4;
-        let columns = [0, 1, 2].map(|k| {
-            let mut d = [0.0; 3];
-            d[k] = h;
-            (residuals(d) - at) / h
-        });
-        let jacobian = nalgebra::SMatrix::<f64, 8, 3>::from_columns(&columns);
-        let step = (jacobian.transpose() * jacobian).try_inverse().unwrap() * (jacobian.transpose() * -at);
-        [step[0], step[1], step[2]]
-    }
-
     proptest! {
-        #[test]
-        fn paper_step_is_the_least_squares_of_equation_3(
-            x in -0.3f32..0.3, y in -0.3f32..0.3, a in -0.2f32..0.2, px in -5.0f32..5.0, pa in -3.1f32..3.1
-        ) {
-            // The robot stands at `truth` in a room that is carried along; the prediction is off by (x, y, a).
-            let truth = pose(px, 1.0, pa);
-            let observed = room();
-            let map = entries(&observed.iter().map(|s| s.transformed(&truth)).collect::<Vec<_>>());
-            let c = components(&truth);
-            let predicted = pose(c.x + x, c.y + y, c.z + a);
-            let got = least_squares(&observed, &all_pairs(4), &map, &predicted, 1e-4).unwrap();
-            let p = components(&predicted);
-            let want = reference_step(&observed, &map, [f64::from(p.x), f64::from(p.y), f64::from(p.z)]);
-            let moved = components(&got.pose) - p;
-            for (g, w) in [moved.x, moved.y, crate::math::wrap_angle(moved.z)].into_iter().zip(want) {
-                prop_assert!((f64::from(g) - w).abs() < 2e-4, "{} {}", g, w);
-            }
-        }
-
         #[test]
         fn map_steps_lead_to_the_true_pose(
             x in -0.2f32..0.2, y in -0.2f32..0.2, a in -0.2f32..0.2, px in -50.0f32..50.0, pa in -3.1f32..3.1
@@ -448,18 +313,6 @@ mod tests {
         assert_eq!(got.observability.verdict, Verdict::Blind);
         assert!((got.covariance - prior.covariance).norm() < 1e-6);
         assert!((components(&got.pose) - components(&prior.pose)).norm() < 1e-6);
-        assert!(least_squares(&[], &[], &[], &prior.pose, 1e-4).is_none());
-    }
-
-    #[test]
-    fn one_wall_and_parallel_walls_are_singular_for_the_paper() {
-        let corridor = [wall((-3.0, 1.0), (3.0, 1.0), 50), wall((-3.0, -1.0), (3.0, -1.0), 50)];
-        let map = entries(&corridor);
-        for n in [1, 2] {
-            assert!(
-                least_squares(&corridor[..n], &all_pairs(n), &map, &pose(0.0, 0.1, 0.02), 1e-4).is_none()
-            );
-        }
     }
 
     #[test]
@@ -541,7 +394,7 @@ mod tests {
             &room().iter().map(|s| crate::joint::with_variances(s, 1e-12, 1e-12)).collect::<Vec<_>>(),
         );
         let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() };
-        let config = MapConfig { kernel_chi2: 1e9, direction_trust_rad: 0.0, ..config() };
+        let config = GaussNewtonConfig { kernel_chi2: 1e9, direction_trust_rad: 0.0, ..config() };
         let (mut sums, mut reported, runs) = ([0.0f32; 3], Matrix3::zeros(), 600);
         for _ in 0..runs {
             let observed: Vec<Segment> = room()

@@ -415,6 +415,13 @@ impl Joint {
         self.release(place, map);
     }
 
+    /// The map has given the place of a segment to another one.
+    pub(crate) fn replaced<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) {
+        if let Some(place) = self.place_of(index) {
+            self.vacate(place, map);
+        }
+    }
+
     /// The map's segment `gone` is no more, and the one at `last` has taken its index.
     pub(crate) fn removed<const N: usize>(&mut self, gone: usize, last: usize, map: &mut SegmentMap<N>) {
         if let Some(place) = self.place_of(gone) {
@@ -717,10 +724,6 @@ impl Joint {
     ) {
         let Some(segment) = map.segments().get(index).map(|s| s.segment) else { return };
         let [var_offset, var_direction] = variances(&segment);
-        if let Some(dropped) = self.place_of(index) {
-            // The map has dropped a segment for this one.
-            self.vacate(dropped, map);
-        }
         let by_pose = by_pose(segment.normal(), segment.moments.centroid.coords - position);
         let seen = Derivative { by_pose, by_lines: heapless::Vec::new() };
         let place = self.free_place(map);
@@ -1172,6 +1175,7 @@ mod tests {
         let mut world = World::new(2);
         world.look();
         let known = world.joint.owners.iter().flatten().count();
+        world.joint.replaced(0, &mut world.map);
         world.joint.add(0, Vector2::zeros(), &mut world.map);
         assert_eq!(world.joint.owners.iter().filter(|owner| **owner == Some(0)).count(), 1);
         assert_eq!(world.joint.owners.iter().flatten().count(), known);

@@ -26,6 +26,12 @@ pub struct KeyframeConfig {
     /// A scan between keyframes only follows the robot. Beams of it are left out where that leaves points no farther
     /// apart than this on a surface that faces the sensor, metres.
     pub spacing_between_m: f32,
+    /// A scan explained to less than this share is no keyframe, …
+    pub min_score: f32,
+    /// … unless so many scans have passed since the last: the robot may have come to where nothing is known.
+    pub scans_below: u32,
+    /// … or so long a way, metres; a radian counts as a metre.
+    pub way_below_m: f32,
 }
 
 /// The last keyframe and the way since.
@@ -113,8 +119,15 @@ mod tests {
     use super::*;
     use crate::pose::pose;
 
-    const CONFIG: KeyframeConfig =
-        KeyframeConfig { way_m: 0.1, scans: 5, at_start: 2, spacing_between_m: 0.0 };
+    const CONFIG: KeyframeConfig = KeyframeConfig {
+        way_m: 0.1,
+        scans: 5,
+        at_start: 2,
+        spacing_between_m: 0.0,
+        min_score: 0.0,
+        scans_below: 0,
+        way_below_m: 0.0,
+    };
 
     #[test]
     fn it_is_due_at_the_start_after_a_way_after_a_turn_and_after_a_while() {

@@ -3,13 +3,15 @@
 //! every machine computes the same bits (tested on the PC and on a Cortex-M4F in emulation).
 //!
 //! The algorithm is that of "Least-square Matching for Mobile Robot SLAM Based on Line-segment Model":
-//! [`SlamConfig::paper`] is the paper step for step, [`SlamConfig::default`] our best, through the same pipeline.
+//! [`SlamConfig::paper`] is what its text says ([`paper`] goes through the equations), [`SlamConfig::default`] our best, through
+//! the same pipeline. What the paper's deviates from its text in has a name of its own: [`SlamConfig::paper_weighted`],
+//! [`SlamConfig::paper_partial`].
 //!
 //! ```text
 //!  ranges_mm ──► deskew ──► extraction ──► association ◄──┐ ──► registration ──► map
 //!                  ▲        [Segment]       [Pair] │      │       [Joint]         │
-//!  ticks ──► odometry ──► predicted pose ──────────▼──► correction   │ ▲    forgetting
-//!            [OdometryTrack]  ▲              heading search          │ │          │
+//!  ticks ──► odometry ──► predicted pose ────────► [Tracker] ───────► │ ▲    forgetting
+//!            [OdometryTrack]  ▲              correction, heading search│ │          │
 //!                             └───── pose, odometry's errors ◄───────┘ loop closure
 //! ```
 //!
@@ -83,9 +85,12 @@ pub mod map;
 pub mod mapper;
 pub mod math;
 pub mod nearby;
+pub mod noise_learning;
 pub mod odometry;
 pub mod odometry_bias;
+pub mod odometry_monitor;
 pub mod odometry_track;
+pub mod paper;
 pub mod pose;
 pub mod registration;
 pub mod residual;
@@ -93,7 +98,10 @@ pub mod scan;
 pub mod segment;
 pub mod slam;
 mod told;
+pub mod tracking;
+pub mod update;
 pub mod visibility;
+pub mod wheel_faults;
 
 pub use config::{ConfigError, SlamConfig};
 pub use map::{MapSegment, SegmentMap};

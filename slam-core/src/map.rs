@@ -1,7 +1,7 @@
 //! The map: a fixed number of line segments in `map`.
 //!
-//! When it is full, the segment that was seen in the fewest scans gives way to the new one, the one unseen for longest
-//! among equals; segments of the scan at hand never do. Each eviction and each segment refused is counted.
+//! When it is full, the segment that is worth least gives way to the new one: scans that saw it, fewer the longer the way since.
+//! Segments of the scan at hand never do. Each eviction and each segment refused is counted.
 
 use heapless::Vec;
 
@@ -23,6 +23,16 @@ pub struct MapSegment {
     pub last_seen: u32,
     /// Way the robot had driven by then, metres.
     pub seen_at_m: f32,
+}
+
+/// After this way unseen a segment is worth half, metres.
+const HALF_WORTH_M: f32 = 5.0;
+
+impl MapSegment {
+    /// What it is worth keeping, to a robot that has driven so far.
+    fn worth(&self, way_m: f32) -> f32 {
+        f32::from(self.hits) / (1.0 + max(way_m - self.seen_at_m, 0.0) / HALF_WORTH_M)
+    }
 }
 
 /// Up to `N` segments; 64·`N` bytes and a few words. `N` may be up to 65 535.
@@ -97,7 +107,9 @@ impl<const N: usize> SegmentMap<N> {
             return Some(self.segments.len() - 1);
         }
         let stale = self.segments.iter_mut().enumerate().filter(|(_, s)| s.last_seen != seen);
-        let Some((index, least)) = stale.min_by_key(|(_, s)| (s.hits, s.last_seen)) else {
+        let Some((index, least)) =
+            stale.min_by(|(_, a), (_, b)| a.worth(seen_at_m).total_cmp(&b.worth(seen_at_m)))
+        else {
             self.counters.refused = self.counters.refused.saturating_add(1);
             return None;
         };

@@ -9,7 +9,7 @@ use core::mem::MaybeUninit;
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::{ConfigError, SlamConfig};
-use crate::odometry::DifferentialDrive;
+use crate::odometry::{DifferentialDrive, Increment};
 use crate::odometry_track::OdometryTrack;
 use crate::scan::Scan;
 use crate::slam::{Slam, SlamUpdate};
@@ -42,6 +42,10 @@ pub struct MapperCounters {
     pub scans_without_odometry: u32,
     /// Times that the robot took up its map again after a reset.
     pub resumed: u32,
+    /// Samples between which the wheels cannot have turned so far; their ticks were left out.
+    pub impossible_steps: u32,
+    /// Those of them after which both counters stood near zero: they had been restarted.
+    pub counters_restarted: u32,
 }
 
 /// Ticks and scans in, poses out. Room for `N` map segments and `K` odometry samples, which must span a scan and its
@@ -85,7 +89,8 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
     }
 
     #[inline(always)]
-    fn blank(config: SlamConfig, drive: DifferentialDrive) -> Self {
+    fn blank(mut config: SlamConfig, drive: DifferentialDrive) -> Self {
+        config.odometry.track_m.get_or_insert(drive.track_m);
         Self {
             slam: Slam::blank(config),
             drive,
@@ -119,14 +124,7 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
 
     /// Takes a sample of the wheels.
     pub fn push(&mut self, ticks: WheelTicks) {
-        let step = match self.last_ticks {
-            Some(last) => self.drive.increment(
-                ticks.left.wrapping_sub(last.left),
-                ticks.right.wrapping_sub(last.right),
-                self.slam.config().odometry.integration,
-            ),
-            None => self.drive.increment(0, 0, self.slam.config().odometry.integration),
-        };
+        let step = self.step_to(&ticks);
         if let Some(unseen) = self.resuming.take() {
             // Across the reset: what the wheels counted, and what they may have done unseen.
             self.slam.coast(&step);
@@ -141,6 +139,24 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
         }
         self.last_ticks = Some(ticks);
         self.pose_us.get_or_insert(ticks.stamp_us);
+    }
+
+    /// What the wheels did since the last sample.
+    fn step_to(&mut self, ticks: &WheelTicks) -> Increment {
+        let integration = self.slam.config().odometry.integration;
+        let Some(last) = self.last_ticks else { return self.drive.increment(0, 0, integration) };
+        let (left, right) = (ticks.left.wrapping_sub(last.left), ticks.right.wrapping_sub(last.right));
+        let step = self.drive.increment(left, right, integration);
+        // Across a reset time is not known.
+        let since_us = if self.resuming.is_some() { 0 } else { ticks.stamp_us.saturating_sub(last.stamp_us) };
+        if self.drive.is_possible(left, right, since_us) {
+            return step;
+        }
+        self.counters.impossible_steps = self.counters.impossible_steps.saturating_add(1);
+        if self.drive.is_possible(ticks.left, ticks.right, since_us) {
+            self.counters.counters_restarted = self.counters.counters_restarted.saturating_add(1);
+        }
+        self.drive.increment(0, 0, integration)
     }
 
     /// Takes a scan whose middle beam was taken at `middle_us`. `None` without odometry for it.
@@ -270,6 +286,22 @@ mod tests {
     }
 
     #[test]
+    fn counters_that_restart_are_no_motion() {
+        let mut mapper = mapper();
+        // Ten metres on the counters, then from zero on.
+        for k in 0..200 {
+            let ticks = if k < 100 { 64_000 + 10 * k as i32 } else { 10 * (k as i32 - 100) };
+            mapper.push(WheelTicks { stamp_us: 5_000 * k, left: ticks, right: ticks });
+            if k % 20 == 19 {
+                mapper.coast(u64::MAX).unwrap();
+            }
+        }
+        assert_eq!((mapper.counters().impossible_steps, mapper.counters().counters_restarted), (1, 1));
+        let x = mapper.slam().pose().translation.x;
+        assert!((x - 198.0 * STEP_M).abs() < 1e-3, "{x}");
+    }
+
+    #[test]
     fn what_cannot_be_used_is_counted() {
         let mut mapper = mapper();
         assert!(mapper.scan(1_000, &[1000; 682]).is_none());
@@ -279,7 +311,8 @@ mod tests {
         // Older than the pose.
         assert!(mapper.scan(1_000, &[1000; 682]).is_none());
         assert!(mapper.scan(30_000, &[1000; 682]).is_some());
-        let expected = MapperCounters { stamps_refused: 2, scans_without_odometry: 2, resumed: 0 };
+        let expected =
+            MapperCounters { stamps_refused: 2, scans_without_odometry: 2, ..MapperCounters::default() };
         assert_eq!(mapper.counters(), expected);
         // The ticks of a refused sample are not lost.
         mapper.push(ticks(5));

@@ -13,15 +13,13 @@ const SECTORS: usize = 12;
 /// Width of the narrowest sector, radians: atan 1/2, less a little for rounding.
 const NARROWEST_RAD: f32 = 0.46;
 
-/// Indices of map segments; 4·`N` bytes and a few words.
+/// Indices of map segments; 2·`N` bytes and a few words.
 #[derive(Clone, Debug)]
 pub struct Nearby<const N: usize> {
     /// By sector.
     indices: Vec<u16, N>,
     /// Where each sector ends.
     ends: [u16; SECTORS],
-    /// As they are found.
-    found: Vec<u16, N>,
 }
 
 impl<const N: usize> Default for Nearby<N> {
@@ -33,10 +31,10 @@ impl<const N: usize> Default for Nearby<N> {
 impl<const N: usize> Nearby<N> {
     /// None.
     pub const fn new() -> Self {
-        Self { indices: Vec::new(), ends: [0; SECTORS], found: Vec::new() }
+        Self { indices: Vec::new(), ends: [0; SECTORS] }
     }
 
-    /// Finds the segments within `reach_m` of the pose that `counts` holds for. Work: one step for each map segment.
+    /// Finds the segments within `reach_m` of the pose that `counts` holds for. Work: two steps for each map segment.
     pub fn gather(
         &mut self,
         map: &[MapSegment],
@@ -44,47 +42,38 @@ impl<const N: usize> Nearby<N> {
         reach_m: f32,
         counts: impl Fn(&MapSegment) -> bool,
     ) {
-        self.found.clear();
-        self.ends = [0; SECTORS];
-        for (index, entry) in map.iter().enumerate() {
+        let near = |entry: &MapSegment| {
             let to_middle = entry.segment.midpoint().coords - pose.translation.vector;
             let radius = reach_m + 0.5 * entry.segment.length_m();
-            if to_middle.norm_squared() <= radius * radius && counts(entry) {
-                // At most as many as the map holds, which is the capacity.
-                let _ = self.found.push(index as u16);
-                if let Some(count) = self.ends.get_mut(sector(entry.segment.direction)) {
-                    *count += 1;
-                }
+            to_middle.norm_squared() <= radius * radius && counts(entry)
+        };
+        // A counting sort: how many of each sector, where each begins, then each to its place.
+        self.ends = [0; SECTORS];
+        for entry in map.iter().filter(|entry| near(entry)) {
+            if let Some(count) = self.ends.get_mut(sector(entry.segment.direction)) {
+                *count += 1;
             }
         }
-        // A counting sort: each sector's end, then from the last segment to the first.
-        let mut end = 0;
-        for count in &mut self.ends {
-            end += *count;
-            *count = end;
+        let mut begin = 0;
+        for end in &mut self.ends {
+            begin += core::mem::replace(end, begin);
         }
         self.indices.clear();
-        // Never more than the capacity.
-        let _ = self.indices.resize(self.found.len(), 0);
-        for &index in self.found.iter().rev() {
-            let Some(entry) = map.get(usize::from(index)) else { continue };
-            let Some(place) = self.ends.get_mut(sector(entry.segment.direction)) else { continue };
-            *place -= 1;
-            if let Some(slot) = self.indices.get_mut(usize::from(*place)) {
-                *slot = index;
+        // At most as many as the map holds, which is the capacity.
+        let _ = self.indices.resize(usize::from(begin), 0);
+        for (index, entry) in map.iter().enumerate().filter(|(_, entry)| near(entry)) {
+            let Some(end) = self.ends.get_mut(sector(entry.segment.direction)) else { continue };
+            if let Some(place) = self.indices.get_mut(usize::from(*end)) {
+                *place = index as u16;
             }
-        }
-        // What was each sector's end is now its beginning.
-        let total = self.indices.len() as u16;
-        self.ends.rotate_left(1);
-        if let Some(last) = self.ends.last_mut() {
-            *last = total;
+            // What was the sector's beginning becomes its end.
+            *end += 1;
         }
     }
 
-    /// All that were found, in the map's order.
+    /// All that were found, by direction.
     pub fn all(&self) -> &[u16] {
-        &self.found
+        &self.indices
     }
 
     /// At least those that run within this angle of a direction.
@@ -190,6 +179,6 @@ mod tests {
         ];
         let mut nearby = Nearby::<4>::new();
         nearby.gather(&map, &Isometry2::identity(), 5.6, |_| true);
-        assert_eq!(nearby.all(), [0, 2]);
+        assert_eq!(nearby.all().iter().copied().collect::<BTreeSet<_>>(), BTreeSet::from([0, 2]));
     }
 }

@@ -34,6 +34,11 @@ pub enum Integration {
     Arc,
 }
 
+/// No wheel of a robot of this kind turns faster, m/s, …
+pub const MOST_SPEED_M_S: f32 = 5.0;
+/// … and ways shorter than this are believed whatever their stamps, which jitter, metres.
+pub const LEAST_JUMP_M: f32 = 0.5;
+
 /// Geometry of the two wheels and their encoders.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -53,6 +58,16 @@ impl DifferentialDrive {
     /// The motion that a difference of both counters means; positive ticks drive forward.
     pub fn increment(&self, left_ticks: i32, right_ticks: i32, integration: Integration) -> Increment {
         self.increment_of_parts(left_ticks as f32, right_ticks as f32, integration)
+    }
+
+    /// Whether wheels can turn so far within a time: by [`MOST_SPEED_M_S`], and by [`LEAST_JUMP_M`] whatever the time.
+    pub fn is_possible(&self, left_ticks: i32, right_ticks: i32, within_us: u64) -> bool {
+        let metres = |ticks: i32, radius_m: f32| {
+            (ticks as f32 * (2.0 * core::f32::consts::PI / self.ticks_per_turn) * radius_m).abs()
+        };
+        let most_m = LEAST_JUMP_M + MOST_SPEED_M_S * within_us as f32 * 1e-6;
+        metres(left_ticks, self.left_wheel_radius_m) <= most_m
+            && metres(right_ticks, self.right_wheel_radius_m) <= most_m
     }
 
     /// The same where ticks come in parts, as from the angles of wheels.

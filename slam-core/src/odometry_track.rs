@@ -20,12 +20,26 @@ pub struct ScanMotion {
     pub since_previous: Increment,
     /// Pose of the base at each knot, in the base at the middle beam. Knot 0 is the first beam's instant.
     pub middle_from_knot: [Isometry2<f32>; SWEEP_KNOTS],
+    /// Time from the first beam to the last, as a share of the time since the previous scan; zero where it is not known.
+    pub sweep_share: f32,
 }
 
 impl ScanMotion {
     /// A motion between scans whose sweep is too short, or too little known, to be undone.
     pub fn instantaneous(since_previous: Increment) -> Self {
-        Self { since_previous, middle_from_knot: [Isometry2::identity(); SWEEP_KNOTS] }
+        Self { since_previous, middle_from_knot: [Isometry2::identity(); SWEEP_KNOTS], sweep_share: 0.0 }
+    }
+
+    /// The same scan with another motion since the previous one, which went on evenly while the scanner swept.
+    #[must_use]
+    pub fn evenly(&self, since_previous: Increment) -> Self {
+        let twist = log(&since_previous.before_from_after) * self.sweep_share;
+        let mut knot = 0;
+        let middle_from_knot = [(); SWEEP_KNOTS].map(|()| {
+            knot += 1;
+            exp(&(twist * ((knot - 1) as f32 / (SWEEP_KNOTS - 1) as f32 - 0.5)))
+        });
+        Self { since_previous, middle_from_knot, ..*self }
     }
 
     /// Whether every number is finite.
@@ -153,7 +167,10 @@ impl<const K: usize> OdometryTrack<K> {
             first_us + 2 * half_sweep_us * (k - 1) / (SWEEP_KNOTS as u64 - 1)
         }))?;
         let middle_from_odom = self.pose_at(middle_us)?.inverse();
-        Some(ScanMotion { since_previous, middle_from_knot: knots.map(|knot| middle_from_odom * knot) })
+        let interval_us = previous_us.map_or(0, |previous| middle_us.saturating_sub(previous));
+        let sweep_share = if interval_us > 0 { geometry.sweep_us() as f32 / interval_us as f32 } else { 0.0 };
+        let middle_from_knot = knots.map(|knot| middle_from_odom * knot);
+        Some(ScanMotion { since_previous, middle_from_knot, sweep_share })
     }
 }
 

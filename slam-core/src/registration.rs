@@ -16,9 +16,10 @@ use crate::keyframe::KeyframeConfig;
 use crate::map::{MapSegment, SegmentMap};
 use crate::math::{max, min, wrap_angle};
 use crate::nearby::Nearby;
+use crate::paper::end_points::EndPointsConfig;
 use crate::pose::{components, cross, is_finite};
 use crate::residual::{LineNoise, Residual};
-use crate::segment::{Moments, Segment};
+use crate::segment::Segment;
 
 /// Most sightings of a keyframe that are taken in.
 pub const MAX_TAKEN: usize = 12;
@@ -30,8 +31,8 @@ const MAX_LONGER: usize = 24;
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
 pub enum RegistrationConfig {
-    /// Fig. 6 of the paper.
-    EndPoints,
+    /// Equation (10) and Fig. 6 of the paper.
+    EndPoints(EndPointsConfig),
     /// Lines are estimated together with the pose, walls fused.
     Joint(JointConfig),
 }
@@ -136,45 +137,13 @@ pub struct Eye {
 
 impl Observed<'_> {
     /// The segments without a pair.
-    fn unknown(&self) -> impl Iterator<Item = &Segment> {
+    pub(crate) fn unknown(&self) -> impl Iterator<Item = &Segment> {
         let known = |index: usize| self.pairs.iter().any(|p| p.observed == index);
         self.segments.iter().enumerate().filter(move |(index, _)| !known(*index)).map(|(_, s)| s)
     }
 }
 
-/// Fig. 6 of the paper: the map by the corrected pose.
-///
-/// Work: one step for each observed segment.
-pub fn register_end_points<const N: usize>(
-    seen: &Observed<'_>,
-    pose: &Isometry2<f32>,
-    map: &mut SegmentMap<N>,
-) -> RegistrationReport {
-    let mut report = RegistrationReport { keyframe: true, settled: true, ..RegistrationReport::default() };
-    for pair in seen.pairs {
-        let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
-        else {
-            continue;
-        };
-        let joined = joined_by_end_points(&entry.segment, &segment.transformed(pose));
-        if !joined.is_finite() {
-            report.doubtful += 1;
-            continue;
-        }
-        entry.segment = joined;
-        mark_seen(entry, &seen.stamp);
-        report.matched += 1;
-    }
-    for segment in seen.unknown() {
-        let segment = segment.transformed(pose);
-        if segment.is_finite() && map.insert(segment, seen.stamp.scan, seen.stamp.way_m).is_some() {
-            report.new += 1;
-        }
-    }
-    report
-}
-
-fn mark_seen(entry: &mut MapSegment, stamp: &Stamp) {
+pub(crate) fn mark_seen(entry: &mut MapSegment, stamp: &Stamp) {
     entry.hits = entry.hits.saturating_add(1);
     entry.last_seen = stamp.scan;
     entry.seen_at_m = stamp.way_m;
@@ -305,7 +274,10 @@ impl Sightings {
             let [var_offset, var_direction] =
                 with_line_noise(variances(segment), &seen.eye.line_noise, segment.length_m());
             let segment = with_variances(&segment.transformed(start.pose), var_offset, var_direction);
-            if segment.is_finite() && map.insert(segment, seen.stamp.scan, seen.stamp.way_m).is_some() {
+            if segment.is_finite()
+                && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
+            {
+                joint.replaced(index, map);
                 report.new += 1;
             }
         }
@@ -394,20 +366,6 @@ impl Pair {
 
 fn with_line_noise([offset, direction]: [f32; 2], noise: &LineNoise, length_m: f32) -> [f32; 2] {
     [offset + noise.var_offset(), direction + noise.var_direction(length_m)]
-}
-
-/// Fig. 6: the least-squares line through the four end points, each as heavy as the points it stands for, as in equation
-/// (3); n = n_m + n_g.
-fn joined_by_end_points(mapped: &Segment, seen: &Segment) -> Segment {
-    let ends = [mapped.start, mapped.end, seen.start, seen.end];
-    let inliers = mapped.moments.inliers.saturating_add(seen.moments.inliers);
-    let weight = mapped.moments.weight + seen.moments.weight;
-    let [before, now] =
-        [mapped, seen].map(|segment| 0.5 * weight * segment.moments.inliers as f32 / inliers as f32);
-    let mut moments = Moments::from_points(ends.into_iter().zip([before, before, now, now]));
-    moments.inliers = inliers;
-    // The map segment's free side is kept: a point just off its middle on that side.
-    Segment::fitted(moments, &ends, mapped.midpoint() + mapped.normal())
 }
 
 /// Fuses each map segment that a scan saw with those that are the same wall. Leaves the segments around the robot in
@@ -518,7 +476,9 @@ fn distance_m(long: &Segment, short: &Segment) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::paper::end_points::{EndPointWeight, register_end_points};
     use crate::pose::{perpendicular, pose};
+    use crate::segment::Moments;
     use nalgebra::{Matrix3, Vector3};
     use std::vec::Vec as StdVec;
 
@@ -535,7 +495,7 @@ mod tests {
     fn config() -> JointConfig {
         match crate::SlamConfig::default().registration {
             RegistrationConfig::Joint(config) => config,
-            RegistrationConfig::EndPoints => unreachable!("the default estimates jointly"),
+            RegistrationConfig::EndPoints(_) => unreachable!("the default estimates jointly"),
         }
     }
 
@@ -577,31 +537,14 @@ mod tests {
             assert!((joined.segment.length_m() - 3.0).abs() < 1e-4, "ends are the farthest feet");
         };
         let (mut map, here) = (SegmentMap::new(), pose(0.0, 0.0, 0.0));
-        let once = register_end_points(&observed(&first, &[], 1), &here, &mut map);
-        let twice = register_end_points(&observed(&second, &pairs, 2), &here, &mut map);
+        let config = EndPointsConfig { weight: EndPointWeight::Equal };
+        let once = register_end_points(&observed(&first, &[], 1), &here, &config, &mut map);
+        let twice = register_end_points(&observed(&second, &pairs, 2), &here, &config, &mut map);
         check(&map, [once, twice]);
         let (mut map, mut joint) = (SegmentMap::new(), joint());
         let once = run(&mut map, &mut joint, &first, &[], 1);
         let twice = run(&mut map, &mut joint, &second, &pairs, 2);
         check(&map, [once, twice]);
-    }
-
-    #[test]
-    fn paper_merge_is_the_line_through_four_end_points() {
-        let mapped = wall((0.0, 1.0), (2.0, 1.0));
-        let seen = wall((0.0, 1.1), (2.0, 1.2));
-        let joined = joined_by_end_points(&mapped, &seen);
-        // Closed form: total least squares of (0, 1), (2, 1), (0, 1.1), (2, 1.2).
-        let (mean_y, xx, xy, yy) = (1.075f64, 4.0f64, 0.1f64, 0.0275f64);
-        let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
-        assert!((f64::from(joined.direction.y.atan2(joined.direction.x)) - angle).abs() < 1e-5);
-        assert!((f64::from(joined.moments.centroid.y) - mean_y).abs() < 1e-6);
-        assert_eq!(joined.moments.inliers, 80);
-        // What was seen often is hardly moved by one more look.
-        let mut often = mapped;
-        often.moments.inliers = 19 * seen.moments.inliers;
-        let joined = joined_by_end_points(&often, &seen);
-        assert!((joined.moments.centroid.y - (0.95 + 0.05 * 1.15)).abs() < 1e-6, "{joined:?}");
     }
 
     #[test]

@@ -161,6 +161,13 @@ pub struct SensorConfig {
     pub mounting: Mounting,
 }
 
+impl SensorConfig {
+    /// How far it sees, metres.
+    pub fn reach_m(&self) -> f32 {
+        f32::from(self.codes.max_mm) * 1e-3
+    }
+}
+
 /// Ranges of one scan, first step first.
 #[derive(Clone, Copy, Debug)]
 pub struct Scan<'a> {

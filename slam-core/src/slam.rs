@@ -5,30 +5,31 @@ use heapless::Vec;
 
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
-use crate::association::{AssociationConfig, Pair, Shortlist, View, associate};
 use crate::config::{ConfigError, SlamConfig};
-use crate::correction::{
-    Correction, CorrectionConfig, MapConfig, Observability, Prior, Standpoint, Verdict, least_squares,
-    maximum_a_posteriori,
-};
+use crate::correction::{Observability, Prior, Verdict};
 use crate::deskew::{DeskewReport, ScanPoint, deskew};
 use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
 use crate::joint::Joint;
-use crate::keyframe::{AmongLines, Keyframe, Settled};
+use crate::keyframe::{AmongLines, Keyframe, KeyframeConfig, Settled};
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
-use crate::map::{MapCounters, MapSegment, SegmentMap};
-use crate::math::{max, min, sqrt, within, wrap_angle};
-use crate::nearby::Nearby;
+use crate::map::{MapSegment, SegmentMap};
+use crate::math::{max, sqrt, wrap_angle};
+use crate::noise_learning::NoiseLearning;
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
+use crate::odometry_monitor::OdometryMonitor;
 use crate::odometry_track::ScanMotion;
+use crate::paper::end_points::register_end_points;
 use crate::pose::{components, is_finite, perpendicular, pose, rotate_covariance};
-use crate::registration::{
-    Eye, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start, register_end_points,
-};
+use crate::registration::{Eye, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start};
 use crate::scan::{Scan, SensorConfig};
 use crate::segment::Segment;
-use crate::visibility::{is_gone, mark_seen_through};
+use crate::tracking::state::{Evidence, StateMonitor};
+use crate::tracking::tracker::{Kernel, Scene, left_out};
+use crate::tracking::{Hypothesis, Tracker, TrackingState};
+pub use crate::update::{Counters, ScanRejection, SlamUpdate, Stage};
+use crate::visibility::{confirmed_and_contradicted, is_gone, mark_seen_through};
+use crate::wheel_faults::{WheelFault, WheelMonitor};
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///
@@ -49,116 +50,13 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     settled: Settled,
     points: Vec<ScanPoint, BEAMS>,
     observed: Vec<Segment, MAX_SEGMENTS>,
-    pairs: Vec<Pair, MAX_SEGMENTS>,
-    nearby: Nearby<N>,
-    shortlist: Shortlist,
-}
-
-/// What happened since the start.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct Counters {
-    /// Scans processed, good or bad.
-    pub scans: u32,
-    /// Scans with another number of ranges than the geometry has beams.
-    pub wrong_beam_count: u32,
-    /// Motions with a number that was not finite; the robot was taken to stand still, unsure by a metre and a radian.
-    pub bad_motion: u32,
-    /// Scans in which no segment was found.
-    pub without_segments: u32,
-    /// Scans that left the pose to the odometry: no pair, or a system that could not be solved.
-    pub uncorrected: u32,
-    /// Moves by odometry alone, without a scan.
-    pub coasted: u32,
-    /// Loops closed.
-    pub loops_closed: u32,
-    /// Segments that one scan had too many.
-    pub crowded_out: u32,
-}
-
-/// Why a scan was not used.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[non_exhaustive]
-pub enum ScanRejection {
-    /// Another number of ranges than the geometry has beams.
-    WrongBeamCount {
-        /// Beams of the geometry.
-        expected: usize,
-        /// Ranges given.
-        actual: usize,
-    },
-}
-
-/// What the core is at.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub enum Stage {
-    /// Where the odometry leads.
-    Prediction,
-    /// Ranges to points.
-    Deskew,
-    /// Points to segments.
-    Extraction,
-    /// Segments to pairs.
-    Association,
-    /// Pairs to pose.
-    Correction,
-    /// Pairs to map.
-    Registration,
-}
-
-impl Stage {
-    /// All of them, in the order of the pipeline.
-    pub const ALL: [Self; 6] = [
-        Self::Prediction,
-        Self::Deskew,
-        Self::Extraction,
-        Self::Association,
-        Self::Correction,
-        Self::Registration,
-    ];
-    /// How many there are.
-    pub const COUNT: usize = Self::ALL.len();
-}
-
-/// Outcome of one scan.
-#[derive(Clone, Copy, Debug)]
-pub struct SlamUpdate {
-    /// Pose of `base` in `map` at the scan's middle beam.
-    pub pose: Isometry2<f32>,
-    /// Covariance of (x, y, θ), in `map`, the error of the map around the robot included.
-    pub covariance: Matrix3<f32>,
-    /// Where the odometry alone put the base, from the last pose.
-    pub predicted: Isometry2<f32>,
-    /// What became of the beams.
-    pub deskew: DeskewReport,
-    /// What was seen.
-    pub extraction: ExtractionReport,
-    /// What it did to the map.
-    pub registration: RegistrationReport,
-    /// Whether the pairs corrected the pose; otherwise it is the prediction.
-    pub corrected: bool,
-    /// Rounds of association and correction.
-    pub iterations: u8,
-    /// Share of the points on observed segments whose segment was recognised, 0 to 1.
-    pub support: f32,
-    /// Root mean square distance of the observed segments from their map lines after the correction, weighted by
-    /// inliers, metres. Zero without pairs.
-    pub residual_m: f32,
-    /// Directions of the pose that the pairs fix.
-    pub observability: Observability,
-    /// Way driven until now, metres.
-    pub way_m: f32,
-    /// Set when this scan closed a loop, and with it the map was bent.
-    pub closure: Option<Closure>,
-    /// Set when the scan was not used. The motion still was.
-    pub rejected: Option<ScanRejection>,
-    /// Counters of the core, this scan included.
-    pub counters: Counters,
-    /// Counters of the map, this scan included.
-    pub map_counters: MapCounters,
+    tracker: Tracker<N>,
+    state: StateMonitor,
+    odometry: OdometryMonitor,
+    learning: NoiseLearning,
+    wheels: WheelMonitor,
+    /// Whether the last scan fixed the pose.
+    fixed: bool,
 }
 
 impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
@@ -216,9 +114,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             settled: Settled::default(),
             points: Vec::new(),
             observed: Vec::new(),
-            pairs: Vec::new(),
-            nearby: Nearby::new(),
-            shortlist: Shortlist::default(),
+            tracker: Tracker::new(),
+            state: StateMonitor::default(),
+            odometry: OdometryMonitor::default(),
+            wheels: WheelMonitor::default(),
+            learning: NoiseLearning::new(config.line_noise, config.odometry.noise),
+            fixed: false,
         }
     }
 
@@ -262,6 +163,16 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.joint.as_ref().map_or_else(OdometryBias::default, Joint::bias)
     }
 
+    /// How far the pose is to be relied on.
+    pub fn state(&self) -> TrackingState {
+        self.state.state()
+    }
+
+    /// What is wrong with the wheels, where that is known.
+    pub fn wheel_fault(&self) -> Option<WheelFault> {
+        self.wheels.fault()
+    }
+
     /// Counters since the start.
     pub fn counters(&self) -> Counters {
         self.counters
@@ -293,6 +204,10 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         motion: &ScanMotion,
         watch: &mut impl FnMut(Stage),
     ) -> SlamUpdate {
+        // Without useful odometry the last motion is taken to go on.
+        let by_odometry = motion.since_previous;
+        let expected = self.odometry.is_useless().then(|| motion.evenly(self.odometry.expected()));
+        let motion = expected.as_ref().unwrap_or(motion);
         let prior = self.predict(motion);
         let mut update = SlamUpdate {
             pose: prior.pose,
@@ -305,6 +220,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             iterations: 0,
             support: 0.0,
             residual_m: 0.0,
+            contradicted_share: 0.0,
+            state: self.state.state(),
+            odometry_left_out: false,
+            odometry_useless: self.odometry.is_useless(),
+            wheel_fault: self.wheels.fault(),
             observability: Observability::BLIND,
             way_m: self.way_m,
             closure: None,
@@ -314,10 +234,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         };
         if update.rejected.is_none() {
             self.observe(scan, motion, &mut update, watch);
-            self.correct(&prior, motion, &mut update, watch);
+            self.correct(&prior, &mut update, watch);
             if let Some(config) = self.config.loop_closure {
                 self.close_loop(&config, &mut update, watch);
             }
+            self.monitor_odometry(&by_odometry, &mut update);
+            self.judge_state(scan, &motion.since_previous, &mut update);
             watch(Stage::Registration);
             update.residual_m = self.residual_m(&update.pose);
             self.register(&mut update);
@@ -443,7 +365,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let lever = perpendicular(from.rotation * increment.before_from_after.translation.vector);
         let mut by_pose = Matrix3::identity();
         (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
-        let noise = rotate_covariance(from, &self.config.odometry.noise.covariance(&increment));
+        let mut noise = self.config.odometry.noise.covariance(&increment);
+        if let Some(config) = self.config.odometry.monitor.as_ref().filter(|_| self.odometry.is_useless()) {
+            noise += self.odometry.expected_covariance(config);
+        }
+        let noise = rotate_covariance(from, &noise);
         Moved { pose: pose(c.x, c.y, c.z), by_pose, noise }
     }
 
@@ -472,37 +398,37 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// From the prediction to the corrected pose.
-    fn correct(
-        &mut self,
-        prior: &Prior,
-        motion: &ScanMotion,
-        update: &mut SlamUpdate,
-        watch: &mut impl FnMut(Stage),
-    ) {
-        watch(Stage::Association);
-        self.find_nearby(&prior.pose, |_| true);
-        let CorrectionConfig::MaximumAPosteriori(config) = self.config.correction else {
-            self.refine(prior, update, Kernel::Strict, watch);
-            return;
-        };
-        let predicted = *update;
-        self.refine(prior, update, Kernel::first(prior, &config), watch);
-        if update.support >= config.search.below_support || self.nearby.all().is_empty() {
-            return;
+    fn correct(&mut self, prior: &Prior, update: &mut SlamUpdate, watch: &mut impl FnMut(Stage)) {
+        let scene = Scene { observed: &self.observed, map: self.map.segments(), config: &self.config };
+        let mut tracked = self.tracker.track(&scene, &self.map_from_base, prior, watch);
+        if self.state.state() == TrackingState::Lost
+            && tracked.hypothesis.score < scene.config.state.good_score
+        {
+            if let Some(found) = self.tracker.look_around(&scene, prior, watch) {
+                tracked.left_out = Some(left_out(&found.pose, &prior.pose));
+                tracked.hypothesis = found;
+            } else {
+                self.tracker.associate(&scene, &tracked.hypothesis);
+            }
         }
-        self.search(prior, motion, &config, &predicted, update, watch);
-        watch(Stage::Association);
-        self.associate(update);
+        let hypothesis = tracked.hypothesis;
+        update.iterations = tracked.iterations;
+        self.counters.searched = self.counters.searched.saturating_add(u32::from(tracked.searched));
+        self.take(hypothesis, update);
+        if let Some(left_out) = &tracked.left_out {
+            update.odometry_left_out = true;
+            update.pose = self.settle() * update.pose;
+            self.loosen_joint(left_out);
+        }
     }
 
-    /// The map segments that a scan from this pose can touch and that count; the paper looks at all of them.
-    fn find_nearby(&mut self, pose: &Isometry2<f32>, counts: impl Fn(&MapSegment) -> bool) {
-        let reach_m = match self.config.association {
-            AssociationConfig::Bisector(_) => f32::INFINITY,
-            AssociationConfig::Gated(_) => self.reach_m(),
-        };
-        self.nearby.gather(self.map.segments(), pose, reach_m, counts);
-        self.shortlist.clear();
+    /// Makes a hypothesis the outcome of the scan.
+    fn take(&mut self, hypothesis: Hypothesis, update: &mut SlamUpdate) {
+        update.corrected = hypothesis.corrected;
+        update.pose = hypothesis.pose;
+        update.covariance = hypothesis.covariance;
+        update.observability = hypothesis.observability;
+        update.support = hypothesis.score;
     }
 
     /// The scan at hand, as the map counts: from one, so that zero is a scan that never was.
@@ -515,91 +441,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     fn eye(&self) -> Eye {
-        Eye { reach_m: self.reach_m(), line_noise: self.config.line_noise }
-    }
-
-    /// How far the sensor sees, metres.
-    fn reach_m(&self) -> f32 {
-        f32::from(self.config.sensor.codes.max_mm) * 1e-3
-    }
-
-    /// Rounds of association and correction from the pose of `update`.
-    fn refine(
-        &mut self,
-        prior: &Prior,
-        update: &mut SlamUpdate,
-        kernel: Kernel,
-        watch: &mut impl FnMut(Stage),
-    ) {
-        let rounds = match &self.config.correction {
-            CorrectionConfig::LeastSquares => 1,
-            CorrectionConfig::MaximumAPosteriori(config) => config.max_iterations,
-        };
-        for _ in 0..rounds {
-            watch(Stage::Association);
-            self.associate(update);
-            watch(Stage::Correction);
-            update.iterations = update.iterations.saturating_add(1);
-            let Some(correction) = self.step(prior, update, kernel) else { break };
-            update.corrected |= !self.pairs.is_empty();
-            update.pose = correction.pose;
-            update.covariance = correction.covariance;
-            update.observability = correction.observability;
-            if self.converged(&correction) {
-                break;
-            }
-        }
-        update.support = self.support();
-    }
-
-    /// Where little of the scan was recognised: the pairs are weighed by the other kernel, and then, as the odometry may have been
-    /// wrong by more than it knows, other headings are tried, with a prior that allows them. The pose from which most is
-    /// recognised wins, if it is much more.
-    fn search(
-        &mut self,
-        prior: &Prior,
-        motion: &ScanMotion,
-        config: &MapConfig,
-        predicted: &SlamUpdate,
-        best: &mut SlamUpdate,
-        watch: &mut impl FnMut(Stage),
-    ) {
-        let mut hypothesis = *predicted;
-        self.refine(prior, &mut hypothesis, Kernel::first(prior, config).other(), watch);
-        let config = &config.search;
-        if hypothesis.support > best.support + config.gain {
-            *best = hypothesis;
-        }
-        if best.support >= config.below_support {
-            return;
-        }
-        let increment = &motion.since_previous;
-        let moved =
-            if increment.is_finite() { min(increment.distance_m + increment.turn_rad, 1.0) } else { 1.0 };
-        let reach_rad = config.reach_rad * moved;
-        let broad = Prior { covariance: broadened(prior, &self.map_from_base, 0.5 * reach_rad), ..*prior };
-        let centre = components(&prior.pose);
-        let mut winner: Option<SlamUpdate> = None;
-        let turns = within(reach_rad / config.step_rad, 0.0, 255.0) as u8;
-        for turn in 1..=turns {
-            for side in [-1.0, 1.0] {
-                let mut hypothesis = *predicted;
-                let offset = side * f32::from(turn) * config.step_rad;
-                hypothesis.pose = pose(centre.x, centre.y, centre.z + offset);
-                hypothesis.covariance = broad.covariance;
-                self.refine(&broad, &mut hypothesis, Kernel::Strict, watch);
-                let least = winner.as_ref().map_or(best.support + config.gain, |w| w.support);
-                if hypothesis.support > least {
-                    winner = Some(hypothesis);
-                }
-            }
-        }
-        if let Some(winner) = winner {
-            *best = winner;
-            best.pose = self.settle() * winner.pose;
-            self.loosen_joint(&(broad.covariance - prior.covariance));
-            self.find_nearby(&best.pose, |_| true);
-        }
+        Eye { reach_m: self.config.sensor.reach_m(), line_noise: self.config.line_noise }
     }
 
     /// Recognises old parts of the map from which the pose has drifted, and closes the loop.
@@ -607,25 +449,27 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         watch(Stage::Association);
         let (map, way_m) = (self.map.segments(), self.way_m);
         let age = |i: &u16| map.get(usize::from(*i)).map_or(0.0, |s| way_m - s.seen_at_m);
-        let oldest = self.nearby.all().iter().map(age).fold(0.0, max);
+        let oldest = self.tracker.nearby.all().iter().map(age).fold(0.0, max);
         if oldest < config.min_way_m {
             return;
         }
         update.pose = self.settle() * update.pose;
-        self.find_nearby(&update.pose, |entry| way_m - entry.seen_at_m >= config.min_way_m);
+        let scene = Scene { observed: &self.observed, map: self.map.segments(), config: &self.config };
+        let old = |entry: &MapSegment| way_m - entry.seen_at_m >= config.min_way_m;
+        self.tracker.gather(scene.map, &update.pose, scene.config, old);
         let prior = Prior { pose: update.pose, covariance: update.covariance + drift(config, oldest) };
-        let mut hypothesis = *update;
-        hypothesis.covariance = prior.covariance;
-        self.refine(&prior, &mut hypothesis, Kernel::Strict, watch);
-        self.find_nearby(&update.pose, |_| true);
+        let start = Hypothesis::of_prior(&prior);
+        let hypothesis = self.tracker.refined(&scene, &prior, start, Kernel::Strict, watch);
+        self.tracker.gather_all(&scene, &update.pose);
         let seen =
-            hypothesis.observability.verdict == Verdict::Full && hypothesis.support >= config.min_support;
+            hypothesis.observability.verdict == Verdict::Full && hypothesis.score >= config.min_support;
         let drifted = chi2_between(&hypothesis.pose, &update.pose, &update.covariance) >= config.min_chi2;
         // The pose knows how far it may have drifted.
         let likely = self.joint.as_ref().is_none_or(|j| {
             chi2_between(&hypothesis.pose, &update.pose, &j.pose_covariance()) <= config.max_chi2
         });
-        let began = self.pairs.iter().filter_map(|p| self.map.segments().get(p.mapped)).map(|s| s.seen_at_m);
+        let began =
+            self.tracker.pairs.iter().filter_map(|p| self.map.segments().get(p.mapped)).map(|s| s.seen_at_m);
         let loop_began_m = began.fold(0.0, max);
         if seen && drifted && likely {
             let closure = Closure { drifted: update.pose, closed: hypothesis.pose, loop_began_m, way_m };
@@ -641,46 +485,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             self.closing = PendingClosure::default();
         }
         watch(Stage::Association);
-        self.associate(update);
-        update.support = self.support();
-    }
-
-    /// Share of the observed inliers that belong to segments with a pair.
-    fn support(&self) -> f32 {
-        let inliers = |s: &Segment| s.moments.inliers as f32;
-        let all: f32 = self.observed.iter().map(inliers).sum();
-        let paired: f32 = self.pairs.iter().filter_map(|p| self.observed.get(p.observed)).map(inliers).sum();
-        if all > 0.0 { paired / all } else { 0.0 }
-    }
-
-    fn associate(&mut self, update: &SlamUpdate) {
-        let config = &self.config;
-        let view =
-            View { pose: &update.pose, covariance: &update.covariance, line_noise: &config.line_noise };
-        let map = self.map.segments();
-        let (nearby, shortlist) = (&self.nearby, &mut self.shortlist);
-        associate(&self.observed, &view, map, nearby, &config.association, shortlist, &mut self.pairs);
-    }
-
-    fn step(&self, prior: &Prior, update: &SlamUpdate, kernel: Kernel) -> Option<Correction> {
-        let (observed, pairs, map) = (&self.observed, &self.pairs, self.map.segments());
-        match &self.config.correction {
-            CorrectionConfig::LeastSquares => {
-                least_squares(observed, pairs, map, &update.pose, self.config.sensor.noise.variance(0.0))
-            }
-            CorrectionConfig::MaximumAPosteriori(config) => {
-                let forgiven = (kernel == Kernel::Forgiving).then_some(&update.covariance);
-                let from = Standpoint { pose: &update.pose, forgiven };
-                maximum_a_posteriori(observed, pairs, map, prior, &from, &self.config.line_noise, config)
-            }
-        }
-    }
-
-    fn converged(&self, correction: &Correction) -> bool {
-        match &self.config.correction {
-            CorrectionConfig::LeastSquares => true,
-            CorrectionConfig::MaximumAPosteriori(config) => correction.step <= config.converged_step,
-        }
+        let scene = Scene { observed: &self.observed, map: self.map.segments(), config: &self.config };
+        self.tracker.associate(&scene, &Hypothesis::at(update.pose, update.covariance));
     }
 
     /// How close to each other the points of the scan at hand need not be, metres.
@@ -696,7 +502,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// Whether the scan at hand is to be taken into the map.
     fn keyframe_is_due(&self) -> bool {
         match &self.config.registration {
-            RegistrationConfig::EndPoints => true,
+            RegistrationConfig::EndPoints(_) => true,
             RegistrationConfig::Joint(config) => self.keyframe.is_due(self.counters.scans, &config.keyframes),
         }
     }
@@ -716,19 +522,80 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         moved.pose
     }
 
+    /// Whether a scan may enter the map: one that is explained, or that the robot has waited for long enough; none while it is lost.
+    fn admits(&self, update: &SlamUpdate, config: &KeyframeConfig) -> bool {
+        let since = &self.keyframe.since;
+        let waited = self.keyframe.scans >= config.scans_below
+            || since.distance_m + since.turn_rad >= config.way_below_m;
+        let at_start = self.counters.scans <= config.at_start || self.tracker.nearby.all().is_empty();
+        update.state != TrackingState::Lost && (update.support >= config.min_score || waited || at_start)
+    }
+
+    /// Whether the pose is to be relied on, by what the map makes of the scan.
+    fn judge_state(&mut self, scan: &Scan<'_>, motion: &Increment, update: &mut SlamUpdate) {
+        if let Some(config) = &self.config.forgetting
+            && update.support < self.config.state.good_score
+        {
+            let (sensor, nearby) = (&self.config.sensor, self.tracker.nearby.all());
+            let map = self.map.segments();
+            let [confirmed, contradicted] =
+                confirmed_and_contradicted(scan, &update.pose, sensor, config, nearby, map);
+            update.contradicted_share =
+                f32::from(contradicted) / f32::from(confirmed.saturating_add(contradicted).max(1));
+        }
+        let evidence = Evidence {
+            score: update.support,
+            contradicted_share: update.contradicted_share,
+            segments: self.observed.len() as u16,
+            way_m: motion.distance_m + motion.turn_rad,
+        };
+        update.state = self.state.update(&evidence, &self.config.state);
+    }
+
+    /// The odometry against the scanner, where this scan and the one before fixed the pose.
+    fn monitor_odometry(&mut self, motion: &Increment, update: &mut SlamUpdate) {
+        let Some(config) = &self.config.odometry.monitor else { return };
+        let fixed = update.support >= config.min_score && update.observability.verdict == Verdict::Full;
+        if fixed && self.fixed {
+            let by_scanner = self.map_from_base.inverse() * update.pose;
+            self.odometry.update(motion, &by_scanner, config);
+            if let Some(track_m) = self.config.odometry.track_m {
+                self.wheels.update(motion, &by_scanner, track_m);
+            }
+        } else {
+            self.odometry.lost_sight();
+            self.wheels.interrupt();
+        }
+        self.fixed = fixed;
+        if let Some(learning) = &self.config.learning {
+            self.learning.drive(&self.odometry_bias().corrected(motion));
+            if update.odometry_left_out || update.closure.is_some() || self.odometry.is_useless() {
+                self.learning.interrupt();
+            } else if fixed {
+                self.learning.fixed(&update.pose, update.observability.weak_sigma_m, learning);
+            }
+            if fixed {
+                self.learning.take_residual(self.residual_m(&update.pose), learning);
+            }
+            self.config.line_noise = self.learning.line_noise(learning);
+            self.config.odometry.noise = self.learning.odometry_noise();
+        }
+        update.odometry_useless = self.odometry.is_useless();
+        update.wheel_fault = self.wheels.fault();
+    }
+
     /// From pairs to map, and with it, in the joint estimate, to the pose.
     fn register(&mut self, update: &mut SlamUpdate) {
-        let RegistrationConfig::Joint(config) = self.config.registration else {
-            let seen = Observed {
-                segments: &self.observed,
-                pairs: &self.pairs,
-                stamp: self.stamp(),
-                eye: self.eye(),
-            };
-            update.registration = register_end_points(&seen, &update.pose, &mut self.map);
-            return;
+        let config = match self.config.registration {
+            RegistrationConfig::Joint(config) => config,
+            RegistrationConfig::EndPoints(config) => {
+                let (segments, pairs) = (&*self.observed, &*self.tracker.pairs);
+                let seen = Observed { segments, pairs, stamp: self.stamp(), eye: self.eye() };
+                update.registration = register_end_points(&seen, &update.pose, &config, &mut self.map);
+                return;
+            }
         };
-        if update.closure.is_none() && !self.keyframe_is_due() {
+        if update.closure.is_none() && !(self.keyframe_is_due() && self.admits(update, &config.keyframes)) {
             let Some(joint) = self.joint.as_mut().filter(|_| self.sightings.wait()) else { return };
             if !self.sightings.take_in(config.taken_per_scan.into(), &config, joint) {
                 update.pose = self.settle() * update.pose;
@@ -743,8 +610,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let prior = carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced);
         self.keyframe = Keyframe::at(prior, AmongLines::of(&update.covariance));
         let start = Start { prior: &prior, pose: &update.pose };
-        let seen =
-            Observed { segments: &self.observed, pairs: &self.pairs, stamp: self.stamp(), eye: self.eye() };
+        let seen = Observed {
+            segments: &self.observed,
+            pairs: &self.tracker.pairs,
+            stamp: self.stamp(),
+            eye: self.eye(),
+        };
         let Some(joint) = &mut self.joint else { return };
         update.registration = self.sightings.make(&seen, &start, &config, joint, &mut self.map);
         if in_a_row || update.closure.is_some() {
@@ -760,12 +631,12 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         };
         let eye = self.eye();
         let Some(joint) = &mut self.joint else { return Isometry2::identity() };
-        let (map, near) = (&mut self.map, &mut self.nearby);
+        let (map, near) = (&mut self.map, &mut self.tracker.nearby);
         let Some([before, after]) = self.sightings.settle(&eye, config, joint, map, near) else {
             return Isometry2::identity();
         };
         // Fusing has renumbered the map's segments.
-        self.shortlist.clear();
+        self.tracker.forget_shortlist();
         self.keyframe.map_from_base = after;
         self.note_settled();
         after * before.inverse()
@@ -776,7 +647,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
         let (sensor, scan_number) = (&self.config.sensor, self.scan_number());
         // As the registration left them: fusing may have moved segments.
-        let nearby = self.nearby.all();
+        let nearby = self.tracker.nearby.all();
         mark_seen_through(scan, &update.pose, scan_number, sensor, &config, nearby, &mut self.map);
         while let Some(index) = self.map.segments().iter().position(|s| is_gone(s, &config)) {
             self.map.forget(index);
@@ -788,7 +659,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
 
     fn residual_m(&self, pose: &Isometry2<f32>) -> f32 {
         let (mut sum, mut points) = (0.0, 0.0);
-        for pair in &self.pairs {
+        for pair in &self.tracker.pairs {
             let (Some(seen), Some(entry)) =
                 (self.observed.get(pair.observed), self.map.segments().get(pair.mapped))
             else {
@@ -810,30 +681,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         add(&mut c.without_segments, u32::from(update.extraction.segments == 0));
         add(&mut c.uncorrected, u32::from(!update.corrected));
         add(&mut c.crowded_out, update.extraction.crowded_out);
-    }
-}
-
-/// What the robust kernel holds against a pair.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Kernel {
-    /// Its misfit: pairs that agree with the pose as it stands lead.
-    Strict,
-    /// What of its misfit the pose's own uncertainty does not explain: what most pairs agree on leads.
-    Forgiving,
-}
-
-impl Kernel {
-    /// The one to begin with.
-    fn first(prior: &Prior, config: &MapConfig) -> Self {
-        let is_close = prior.covariance.m33 < config.close_heading_rad * config.close_heading_rad;
-        if is_close { Self::Forgiving } else { Self::Strict }
-    }
-
-    fn other(self) -> Self {
-        match self {
-            Self::Strict => Self::Forgiving,
-            Self::Forgiving => Self::Strict,
-        }
+        add(&mut c.odometry_left_out, u32::from(update.odometry_left_out));
+        add(&mut c.lost, u32::from(update.state == TrackingState::Lost));
     }
 }
 
@@ -844,15 +693,6 @@ struct Moved {
     by_pose: Matrix3<f32>,
     /// Covariance that the motion adds.
     noise: Matrix3<f32>,
-}
-
-/// The prior's covariance with a heading error of `sigma_rad` on top, made half before and half after the motion.
-fn broadened(prior: &Prior, map_from_previous: &Isometry2<f32>, sigma_rad: f32) -> Matrix3<f32> {
-    let moved = prior.pose.translation.vector - map_from_previous.translation.vector;
-    let lever = perpendicular(moved);
-    let early = nalgebra::Vector3::new(lever.x, lever.y, 1.0);
-    let late = nalgebra::Vector3::new(0.0, 0.0, 1.0);
-    prior.covariance + (early * early.transpose() + late * late.transpose()) * (0.5 * sigma_rad * sigma_rad)
 }
 
 /// Squared Mahalanobis distance between two poses.

@@ -53,6 +53,51 @@ pub fn mark_seen_through<const N: usize>(
     }
 }
 
+/// How many map segments seen before lie where a scan from this pose measured something, and how many it saw through.
+///
+/// Work: three look-ups for each candidate.
+pub fn confirmed_and_contradicted(
+    scan: &Scan<'_>,
+    pose: &Isometry2<f32>,
+    sensor: &SensorConfig,
+    config: &ForgetConfig,
+    candidates: &[u16],
+    map: &[MapSegment],
+) -> [u16; 2] {
+    let laser_from_map = (pose * sensor.mounting.base_from_laser).inverse();
+    let mut counts = [0u16; 2];
+    for entry in candidates.iter().filter_map(|candidate| map.get(usize::from(*candidate))) {
+        let counted = match () {
+            () if entry.hits < config.scans => continue,
+            () if seen_through(&entry.segment, scan, &laser_from_map, sensor, config) => 1,
+            () if measured(&entry.segment, scan, &laser_from_map, sensor, config) => 0,
+            () => continue,
+        };
+        if let Some(count) = counts.get_mut(counted) {
+            *count = count.saturating_add(1);
+        }
+    }
+    counts
+}
+
+/// Whether the beam towards the middle of a segment ended there.
+fn measured(
+    segment: &Segment,
+    scan: &Scan<'_>,
+    laser_from_map: &Isometry2<f32>,
+    sensor: &SensorConfig,
+    config: &ForgetConfig,
+) -> bool {
+    let point = laser_from_map * segment.midpoint();
+    let facing = (laser_from_map.rotation * segment.normal()).dot(&point.coords) < 0.0;
+    let distance = sqrt(point.coords.norm_squared());
+    facing
+        && range_towards(&point.coords, scan, sensor).is_some_and(|range_m| {
+            let margin_m = config.margin_m + config.margin_sigmas * sqrt(sensor.noise.variance(range_m));
+            (range_m - distance).abs() <= margin_m
+        })
+}
+
 /// Whether a segment has been seen through often enough to be forgotten.
 pub fn is_gone(entry: &MapSegment, config: &ForgetConfig) -> bool {
     entry.seen_through >= config.scans && entry.seen_through >= entry.hits

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use slam_core::SlamConfig;
 
+use super::firmness::{Firmness, Noise, firmness};
 use super::walls::{Walls, walls};
 use super::{Container, Found, Row, figure};
 use crate::log::{self, Log, ReadOptions};
@@ -83,6 +84,8 @@ pub struct Measured {
     pub reference: Option<ByReference>,
     /// By relations, where there are any.
     pub relations: Option<ByRelations>,
+    /// What becomes of its main measure with noise, where that was asked for.
+    pub firmness: Option<Firmness>,
     /// Picture of the map.
     pub figure: String,
 }
@@ -94,8 +97,8 @@ impl Measured {
     }
 }
 
-/// Replays and scores a log. `data` is left out of what is said of files.
-pub fn measure(found: Found, data: &Path) -> Row {
+/// Replays and scores a log, and again with noise where that is asked for. `data` is left out of what is said of files.
+pub fn measure(found: Found, data: &Path, noise: &Noise) -> Row {
     let mut remarks = Vec::new();
     if !found.same.is_empty() {
         remarks.push(format!(
@@ -107,7 +110,7 @@ pub fn measure(found: Found, data: &Path) -> Row {
             }
         ));
     }
-    let outcome = replayed(&found, &mut remarks).map_err(|error| whole(&*error));
+    let outcome = replayed(&found, noise, &mut remarks).map_err(|error| whole(&*error));
     let shown = |text: String| {
         let folder = format!("{}/", data.display().to_string().trim_end_matches('/'));
         text.replace(&folder, "").split_whitespace().collect::<Vec<_>>().join(" ")
@@ -126,7 +129,7 @@ fn whole(error: &(dyn Error + 'static)) -> String {
     text
 }
 
-fn replayed(found: &Found, remarks: &mut Vec<String>) -> Result<Measured, Box<dyn Error>> {
+fn replayed(found: &Found, noise: &Noise, remarks: &mut Vec<String>) -> Result<Measured, Box<dyn Error>> {
     let log = log::read(&found.path, &ReadOptions::default())?;
     remarks.extend(log.warnings.iter().map(|w| w.message.clone()));
     let robot = log.usual_robot();
@@ -145,6 +148,19 @@ fn replayed(found: &Found, remarks: &mut Vec<String>) -> Result<Measured, Box<dy
         Some((scored?, reference))
     });
     let relations = fitting(&found.relations, &poses.online, remarks);
+    let trajectory = reference.as_ref().map(|(_, trajectory)| trajectory.as_slice());
+    // Relations were checked by hand; references have errors of their own.
+    let (measure, main): (_, MainMeasure<'_>) = match (&relations, trajectory) {
+        (Some(relations), _) => ("relations, m", &|r| online_relation_error_m(found, r, relations)),
+        (None, Some(trajectory)) => {
+            ("ATE, m", &|r| score::absolute_trajectory_error(&stamped(r, |s| &s.pose), trajectory))
+        }
+        (None, None) => ("", &|_| None),
+    };
+    let firmness = match main(&replay) {
+        Some(plain_m) if noise.runs > 0 => firmness((&log, &robot), noise, measure, plain_m, main)?,
+        _ => None,
+    };
     Ok(Measured {
         scans: replay.steps.len(),
         skipped: log.skipped.values().sum(),
@@ -153,16 +169,14 @@ fn replayed(found: &Found, remarks: &mut Vec<String>) -> Result<Measured, Box<dy
         took: replay.steps.iter().map(|s| s.took).sum(),
         slam_bytes: replay.slam_bytes,
         relations: relations.and_then(|r| by_relations(found, &replay, &poses, &r)),
-        figure: figure::draw(
-            &found.name,
-            &log,
-            &replay,
-            &poses.in_final_map,
-            reference.as_ref().map(|(_, r)| r.as_slice()),
-        ),
+        figure: figure::draw(&found.name, &log, &replay, &poses.in_final_map, trajectory),
+        firmness,
         reference: reference.map(|(scored, _)| scored),
     })
 }
+
+/// One figure of a replay, metres.
+type MainMeasure<'a> = &'a (dyn Fn(&Replay) -> Option<f64> + Sync);
 
 fn stamped(replay: &Replay, pose: impl Fn(&replay::Step) -> &nalgebra::Isometry2<f32>) -> Vec<StampedPose> {
     replay.steps.iter().map(|s| StampedPose::of_core(s.stamp_us, pose(s))).collect()
@@ -193,15 +207,25 @@ fn by_relations(
     poses: &Poses<Vec<StampedPose>>,
     relations: &[Relation],
 ) -> Option<ByRelations> {
-    // Freiburg 079's relations are those of the laser; at the other places it sits at the robot's centre.
-    let of_laser = found.log == "fr079";
-    let laser_m = f64::from(replay.config.sensor.mounting.base_from_laser.translation.x);
-    let laser_m = if of_laser { (laser_m * 1e6).round() * 1e-6 } else { 0.0 };
+    let laser_m = laser_m(found, replay);
     let errors = poses.try_map(|p| score::relation_errors(&at_laser(p, laser_m), relations))?;
     // Other texts with these names have odometry that was made for them, or corrected.
     let is_clf = found.name.ends_with(".clf");
     let published = found.container == Container::Bag || is_clf;
     Some(ByRelations { laser_m, errors, published })
+}
+
+/// How far ahead of the robot's centre the frame of a log's relations is, metres.
+fn laser_m(found: &Found, replay: &Replay) -> f64 {
+    // Freiburg 079's relations are those of the laser; at the other places it sits at the robot's centre.
+    let of_laser = found.log == "fr079";
+    let laser_m = f64::from(replay.config.sensor.mounting.base_from_laser.translation.x);
+    if of_laser { (laser_m * 1e6).round() * 1e-6 } else { 0.0 }
+}
+
+fn online_relation_error_m(found: &Found, replay: &Replay, relations: &[Relation]) -> Option<f64> {
+    let poses = at_laser(&stamped(replay, |s| &s.pose), laser_m(found, replay));
+    Some(score::relation_errors(&poses, relations)?.errors.trans_m)
 }
 
 /// The relations of the time of the log, of the files that may have them; a remark where there are only others.

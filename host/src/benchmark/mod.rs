@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!  folder ──► discover: logs, references, relations ──► measure: replay and score ──► tables, page
-//!                                                        published: others' figures ──┘
+//!                                        (perturb, firmness: again with noise)  published: others' figures ──┘
 //! ```
 //!
 //! Logs are replayed one after the other, so that the time of the core is that of a core at rest. A log that cannot be read, or
@@ -10,8 +10,10 @@
 
 mod discover;
 mod figure;
+mod firmness;
 mod measure;
 pub mod page;
+mod perturb;
 pub mod published;
 pub mod tables;
 #[cfg(test)]
@@ -21,6 +23,7 @@ mod walls;
 use std::path::PathBuf;
 
 pub use discover::{Container, Found, find};
+pub use firmness::{Firmness, Noise};
 pub use measure::{ByReference, ByRelations, Measured, Poses, measure};
 pub use walls::{PASS_M, Walls, walls};
 

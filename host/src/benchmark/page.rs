@@ -3,8 +3,8 @@
 use std::fmt::Write;
 
 use super::published::{Measure, PUBLISHED, SOURCES};
-use super::tables::{cost_table, relation_tables, trajectory_table, walls_table};
-use super::{Found, PASS_M, Row};
+use super::tables::{cost_table, firm_table, relation_tables, trajectory_table, walls_table};
+use super::{Found, Noise, PASS_M, Row};
 
 /// Name of a log's picture.
 pub fn image(found: &Found) -> String {
@@ -35,8 +35,9 @@ fn absent(rows: &[Row]) -> Vec<String> {
     absent
 }
 
-/// The page. `command` is what the reader types for it, `images` the pictures' folder as seen from the page.
-pub fn render(rows: &[Row], command: &str, images: &str) -> String {
+/// The page. `command` is what the reader types for it, `noise` how it replayed logs again, `images` the pictures' folder as seen
+/// from the page.
+pub fn render(rows: &[Row], command: &str, noise: &Noise, images: &str) -> String {
     let mut page = String::new();
     let mut say = |text: &str| {
         // Writing to a String cannot fail.
@@ -72,6 +73,7 @@ pub fn render(rows: &[Row], command: &str, images: &str) -> String {
         say(&used.to_string());
         say(RELATIONS);
     }
+    firmness(rows, command, noise, &mut say);
     say("## What it took");
     say(&cost_table(rows).to_string());
     say(COST);
@@ -105,6 +107,25 @@ pub fn render(rows: &[Row], command: &str, images: &str) -> String {
     page
 }
 
+/// What becomes of the figures with noise, or how to find out.
+fn firmness(rows: &[Row], command: &str, noise: &Noise, say: &mut impl FnMut(&str)) {
+    say("## How firmly the figures stand");
+    if noise.runs == 0 {
+        say(&format!("Not tried for this page. {FIRMNESS} This command does, 20 times a log:"));
+        say(&format!("```sh\n{command} --runs 20\n```"));
+        return;
+    }
+    let (runs, mm) = (noise.runs, 1e3 * noise.sigma_m);
+    say(&format!(
+        "Each log was replayed {runs} times more, with Gaussian noise of {mm} mm on every range (seeds 1 to {runs}). {FIRMNESS}"
+    ));
+    match firm_table(rows) {
+        Some(table) => say(&table.to_string()),
+        None => say("No log has a reference or relations, and so none has a figure."),
+    }
+    say(&format!("```sh\n{command}\n```"));
+}
+
 /// What the reader should know of the logs, a line each.
 pub fn remarks(rows: &[Row]) -> Vec<String> {
     let of = |row: &Row| row.remarks.iter().map(|text| line(row, text)).collect::<Vec<String>>();
@@ -135,6 +156,10 @@ A relation says where the robot was at one instant as seen from another; people 
 distance between that and what the trajectory says, linear between its poses. The relations of fr079 are those of the laser, so
 the poses are moved to where the log says that it sits. Others' figures are of final, corrected trajectories, so *final* is what
 compares with them. None stands beside a log whose odometry was made for it.";
+
+const FIRMNESS: &str = "\
+A figure of one drive is one draw: noise less than the scanner's own\nshows how much of it is chance. The error is online, metres: the mean of the relations where there are any, else the absolute\n\
+trajectory error.";
 
 const COST: &str = "\
 *scans used* is what the core took in, *records skipped* what the reader passed over or could not use. *loops closed* counts

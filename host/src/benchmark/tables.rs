@@ -185,6 +185,41 @@ pub(super) fn relation_tables(rows: &[Row]) -> Option<[Table; 3]> {
     ])
 }
 
+/// What becomes of the main measures with noise, of the logs that were replayed so.
+fn firm_rows(rows: &[Row]) -> Vec<[String; 5]> {
+    let firm = rows.iter().filter_map(|row| Some((row, row.outcome.as_ref().ok()?.firmness?)));
+    firm.map(|(row, f)| {
+        let [plain, median, worst] = [f.plain_m, f.median_m, f.worst_m].map(|m| figure(m, 3));
+        [row.found.name.clone(), f.measure.into(), plain, median, worst]
+    })
+    .collect()
+}
+
+const FIRM: [&str; 5] = ["log", "online error of", "plain", "median with noise", "worst with noise"];
+
+/// The same for the page; `None` where no log was replayed with noise.
+pub(super) fn firm_table(rows: &[Row]) -> Option<Table> {
+    let firm = firm_rows(rows);
+    let mut table = markdown(FIRM);
+    let some = !firm.is_empty();
+    table.add_rows(firm);
+    some.then_some(table)
+}
+
+/// And for the terminal.
+pub fn firm_summary(rows: &[Row]) -> Option<Table> {
+    let firm = firm_rows(rows);
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_FULL_CONDENSED);
+    table.set_header(FIRM);
+    for column in table.column_iter_mut().skip(2) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let some = !firm.is_empty();
+    table.add_rows(firm);
+    some.then_some(table)
+}
+
 /// What each log took.
 pub(super) fn cost_table(rows: &[Row]) -> Table {
     let mut table = markdown([

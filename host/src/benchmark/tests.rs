@@ -30,6 +30,7 @@ fn measured() -> Measured {
         slam_bytes: 87 * 1024,
         reference: None,
         relations: None,
+        firmness: None,
         figure: "<svg/>".into(),
     }
 }
@@ -89,7 +90,7 @@ fn the_table_has_each_log_the_others_figures_and_no_nan() {
 
 #[test]
 fn the_page_has_tables_pictures_sources_and_no_nan() {
-    let page = render(&rows(), "the command", "images");
+    let page = render(&rows(), "the command", &Noise::NONE, "images");
     for word in [
         "```sh\nthe command\n```",
         "| lineslam, online",
@@ -113,9 +114,29 @@ fn the_page_has_tables_pictures_sources_and_no_nan() {
 #[test]
 fn without_references_the_page_has_no_empty_tables() {
     let rows = &rows()[3..];
-    let page = render(rows, "the command", "images");
+    let page = render(rows, "the command", &Noise::NONE, "images");
     for heading in ["## Absolute", "## Relations", "## How thick"] {
         assert!(!page.contains(heading), "{page}");
     }
     assert!(page.contains("csail with reference") && page.contains("hospital with relations"), "{page}");
+}
+
+#[test]
+fn figures_with_noise_stand_on_the_page_where_they_were_asked_for_and_otherwise_how_to_ask() {
+    let page = render(&rows(), "the command", &Noise::NONE, "images");
+    assert!(
+        page.contains("## How firmly the figures stand\n\nNot tried")
+            && page.contains("the command --runs 20\n")
+    );
+    assert!(super::tables::firm_summary(&rows()).is_none());
+    let mut rows = rows();
+    let firmness = Firmness { measure: "ATE, m", plain_m: 0.2601, median_m: 0.2702, worst_m: 1.5003 };
+    rows[0].outcome.as_mut().unwrap().firmness = Some(firmness);
+    let noise = Noise { runs: 20, sigma_m: 0.005 };
+    let page = render(&rows, "the command", &noise, "images");
+    assert!(page.contains("20 times more, with Gaussian noise of 5 mm"), "{page}");
+    let line = page.lines().find(|line| line.contains("1.500")).unwrap();
+    let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+    assert_eq!(cells[1..6], ["csail.log", "ATE, m", "0.260", "0.270", "1.500"]);
+    assert!(super::tables::firm_summary(&rows).unwrap().to_string().contains("1.500"));
 }

@@ -4,9 +4,9 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clap::ValueEnum;
 use comfy_table::{CellAlignment, Table, presets};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+pub use lineslam::configuration::Configuration;
 use lineslam::log::Log;
 use lineslam::output::grid::Grid;
 use lineslam::output::report::Report;
@@ -14,37 +14,6 @@ use lineslam::output::svg::{Picture, Scene};
 use lineslam::output::{self, csv, dxf, mcap, svg, trajectory_csv, tum};
 use lineslam::replay::{self, Replay, ReplayError};
 use lineslam::robot::Robot;
-use slam_core::SlamConfig;
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Configuration {
-    Default,
-    Paper,
-}
-
-impl Configuration {
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Default => "default",
-            Self::Paper => "paper",
-        }
-    }
-
-    /// For pictures.
-    pub fn subtitle(self) -> &'static str {
-        match self {
-            Self::Default => "default configuration",
-            Self::Paper => "paper configuration",
-        }
-    }
-
-    pub fn config(self) -> SlamConfig {
-        match self {
-            Self::Default => SlamConfig::default(),
-            Self::Paper => SlamConfig::paper(),
-        }
-    }
-}
 
 /// Writes a single file, whole or not at all.
 pub fn write_one(path: &Path, text: String) -> anyhow::Result<()> {
@@ -123,6 +92,7 @@ pub fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {
         ("scans used", report.scans_used.to_string()),
         ("records skipped", skipped),
         ("driven", format!("{:.1} m in {:.1} s", report.distance_m, report.duration_s)),
+        ("tracking", report.tracking.line()),
         ("map", format!("{} segments, room for {}", report.segments, report.map_capacity)),
         (
             "time for a scan, here",

@@ -15,6 +15,9 @@ pub struct Args {
     /// Seed of the first drive; the others follow.
     #[arg(long, default_value_t = 1001)]
     first_seed: u64,
+    /// RANSAC seeds of each drive, for the paper's configurations.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    ransac_seeds: u64,
     /// Folder of the worlds hall, corridor, office and parallel.
     #[arg(long, value_name = "FOLDER", default_value = "worlds")]
     worlds: PathBuf,
@@ -25,13 +28,14 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let seeds = args.first_seed..args.first_seed.saturating_add(u64::from(args.seeds));
-    let options = experiments::Options { worlds: args.worlds.clone(), seeds };
+    let options =
+        experiments::Options { worlds: args.worlds.clone(), seeds, ransac_seeds: args.ransac_seeds };
     let progress = progress_bar(experiments::steps(&options), "drives");
     let results = experiments::run(&options, || progress.inc(1))?;
     progress.finish_and_clear();
     let command = format!(
-        "cargo run --release -p lineslam -- experiments --seeds {} --first-seed {}",
-        args.seeds, args.first_seed
+        "cargo run --release -p lineslam -- experiments --seeds {} --first-seed {} --ransac-seeds {}",
+        args.seeds, args.first_seed, args.ransac_seeds
     );
     let page = document::render(&results, &command, "images");
     let mut files: Vec<(PathBuf, Vec<u8>)> = vec![("experiments.md".into(), page.into_bytes())];

@@ -18,7 +18,7 @@ pub struct Args {
     /// mines.toml for a mines log and of sick.toml for others.
     #[arg(long, value_name = "FILE")]
     robot: Option<PathBuf>,
-    /// Which algorithm: the best we know, or the paper step for step.
+    /// Which algorithm.
     #[arg(long, value_enum, default_value_t = Configuration::Default)]
     config: Configuration,
     /// Folder for trajectory.tum and .csv, trajectory_final.tum, odometry.tum, map.csv, map.svg, map.dxf, map.pgm with

@@ -22,7 +22,7 @@ pub struct Args {
     /// Robot file. By default paper.toml.
     #[arg(long, value_name = "FILE")]
     robot: Option<PathBuf>,
-    /// Which algorithm: the best we know, or the paper step for step.
+    /// Which algorithm.
     #[arg(long, value_enum, default_value_t = Configuration::Default)]
     config: Configuration,
     /// Folder for all that replay writes, and for log.jsonl, which replay reads, and truth.tum.

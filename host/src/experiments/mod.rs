@@ -1,19 +1,22 @@
 //! The paper's experiments, and more: simulated buildings over many seeds, with what is wrong with the robot made worse.
-//! [`run`] measures, [`document`] writes the page, [`figures`] draws. Recorded logs are those of [`benchmark`](crate::benchmark).
+//! [`run`] measures, [`papers`] what the paper's configurations do, [`document`] writes the page, [`figures`] draws. Recorded logs are those of [`benchmark`](crate::benchmark).
 
 pub mod document;
 pub mod figures;
+pub mod papers;
+mod papers_page;
 
 use std::path::PathBuf;
 
 use rayon::prelude::*;
 use slam_core::SlamConfig;
+use slam_core::correction::Verdict;
 
 use crate::replay::{self, Replay, ReplayError};
 use crate::robot::Robot;
 use crate::sim::judge::{self, Judgement, TrajectoryErrors};
 use crate::sim::world::World;
-use crate::sim::{self, Drive, SimConfig, WheelModel};
+use crate::sim::{self, Drive, SimConfig};
 use crate::toml_file::FileError;
 
 /// A building of the experiments.
@@ -74,6 +77,8 @@ pub struct Measured {
     pub judgement: Judgement,
     /// Segments of the map.
     pub segments: usize,
+    /// Share of the scans that had pairs which do not determine the whole pose.
+    pub singular: f64,
 }
 
 impl Measured {
@@ -92,10 +97,6 @@ pub struct Run {
     pub condition: usize,
     /// What the default configuration made of it.
     pub default: Measured,
-    /// What the paper's did, under the usual errors.
-    pub paper: Option<Measured>,
-    /// The same on a drive whose wheels are as the robot file says, as the paper's must have been.
-    pub paper_calibrated: Option<Measured>,
     /// What the wheels said.
     pub dead_reckoning: TrajectoryErrors,
 }
@@ -110,6 +111,10 @@ pub struct Results {
     pub seeds: std::ops::Range<u64>,
     /// Every simulated drive.
     pub runs: Vec<Run>,
+    /// The paper's configurations, and the default beside them.
+    pub papers: Vec<papers::PaperRun>,
+    /// RANSAC seeds of each drive.
+    pub ransac_seeds: u64,
     /// The figures.
     pub figures: Vec<Figure>,
 }
@@ -121,6 +126,14 @@ pub struct Options {
     pub worlds: PathBuf,
     /// The seeds of the simulated drives.
     pub seeds: std::ops::Range<u64>,
+    /// RANSAC seeds of each drive, for the paper's configurations.
+    pub ransac_seeds: u64,
+}
+
+impl Options {
+    fn world(&self, name: &str) -> Result<World, FileError> {
+        World::load(&self.worlds.join(format!("{name}.toml")))
+    }
 }
 
 /// Why the experiments could not be run.
@@ -137,15 +150,14 @@ pub enum ExperimentError {
 /// Number of steps that [`run`] reports.
 pub fn steps(options: &Options) -> usize {
     let drives = BUILDINGS.len() * CONDITIONS.len() + 1;
-    drives * (options.seeds.end - options.seeds.start) as usize
+    drives * (options.seeds.end - options.seeds.start) as usize + papers::steps(options)
 }
 
 /// Runs everything. `progress` is called after each drive, from any thread.
 pub fn run(options: &Options, progress: impl Fn() + Sync) -> Result<Results, ExperimentError> {
-    let load = |name: &str| World::load(&options.worlds.join(format!("{name}.toml")));
     let mut jobs = Vec::new();
     for name in BUILDINGS.map(|b| b.name).into_iter().chain([FEATURELESS]) {
-        let world = std::sync::Arc::new(load(name)?);
+        let world = std::sync::Arc::new(options.world(name)?);
         let conditions = if name == FEATURELESS { 1 } else { CONDITIONS.len() };
         for condition in 0..conditions {
             jobs.extend(options.seeds.clone().map(|seed| (name, world.clone(), condition, seed)));
@@ -159,11 +171,14 @@ pub fn run(options: &Options, progress: impl Fn() + Sync) -> Result<Results, Exp
             run
         })
         .collect::<Result<Vec<Run>, ReplayError>>()?;
+    let papers = papers::run(options, &progress)?;
     let mut figures = Vec::new();
     for name in ["hall", "corridor", "office"] {
-        figures.extend(figures::simulated(&load(name)?, options.seeds.start)?);
+        figures.extend(figures::simulated(&options.world(name)?, options.seeds.start)?);
     }
-    Ok(Results { seeds: options.seeds.clone(), runs, figures })
+    figures.extend(figures::papers(&options.world("corridor")?, options.seeds.start)?);
+    let ransac_seeds = options.ransac_seeds;
+    Ok(Results { seeds: options.seeds.clone(), runs, papers, ransac_seeds, figures })
 }
 
 /// One drive in a world, under a condition of [`CONDITIONS`].
@@ -173,22 +188,26 @@ pub fn simulated(name: &'static str, world: &World, condition: usize, seed: u64)
     for setting in CONDITIONS[condition].settings {
         errors.set(setting).expect("the conditions are constants");
     }
-    let measure = |drive: &Drive, config: SlamConfig| -> Result<(Measured, Replay), ReplayError> {
-        let replay = replay::run(&drive.log, &robot, config, || {})?;
-        let judgement = judge::judge(world, drive, &replay);
-        Ok((Measured { judgement, segments: replay.map.len() }, replay))
-    };
     let drive = sim::drive(world, &robot, &errors, seed)?;
-    let (default, replay) = measure(&drive, SlamConfig::default())?;
+    let (default, replay) = measure(world, &drive, &robot, SlamConfig::default())?;
     let odometry = judge::in_world(&drive, replay.steps.iter().map(|s| s.odometry));
     let dead_reckoning = judge::trajectory_errors(&drive.truth, &odometry);
-    let (mut paper, mut paper_calibrated) = (None, None);
-    if condition == 0 {
-        paper = Some(measure(&drive, SlamConfig::paper())?.0);
-        errors.wheel =
-            WheelModel { radius_error: 0.0, radius_difference: 0.0, track_error: 0.0, ..errors.wheel };
-        let calibrated = sim::drive(world, &robot, &errors, seed)?;
-        paper_calibrated = Some(measure(&calibrated, SlamConfig::paper())?.0);
-    }
-    Ok(Run { world: name, condition, default, paper, paper_calibrated, dead_reckoning })
+    Ok(Run { world: name, condition, default, dead_reckoning })
+}
+
+/// One configuration on one drive, and what it was judged by.
+fn measure(
+    world: &World,
+    drive: &Drive,
+    robot: &Robot,
+    config: SlamConfig,
+) -> Result<(Measured, Replay), ReplayError> {
+    let replay = replay::run(&drive.log, robot, config, || {})?;
+    let judgement = judge::judge(world, drive, &replay);
+    let is_singular = |step: &&replay::Step| {
+        let update = &step.update;
+        update.registration.matched > 0 && update.observability.verdict != Verdict::Full
+    };
+    let singular = replay.steps.iter().filter(is_singular).count() as f64 / replay.steps.len().max(1) as f64;
+    Ok((Measured { judgement, segments: replay.map.len(), singular }, replay))
 }

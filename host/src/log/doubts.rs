@@ -8,8 +8,10 @@
 //! fhw, test_lab2 (more than three quarters agree). Logs of key scans alone have too few pairs to be judged.
 
 use slam_core::scan::{Reading, SensorConfig};
+use slam_core::wheel_faults::WheelFault;
 
 use super::{Log, Warning};
+use crate::output::tracking::Tracking;
 use crate::replay::{Replay, Step};
 use crate::robot::Robot;
 
@@ -37,16 +39,33 @@ const LEAST_POINTS: f64 = 0.02;
 const BEAM_STRIDE: usize = 3;
 const LEAST_BEAMS: usize = 20;
 
+/// Scans that overrule the odometry, beyond which it is said; one or two may on a good drive.
+const FEW_LEFT_OUT: usize = 3;
+
 /// What is odd about a drive.
 pub fn of_drive(log: &Log, robot: &Robot, replay: &Replay) -> Vec<Warning> {
     let mut warnings = Vec::new();
     // A reader that knows why there is none has said it.
     let said = log.warnings.iter().any(|warning| warning.suspected == NO_ODOMETRY);
     if !log.odometry.is_empty() {
-        warnings.extend(odometry_against_scanner(log, robot, &replay.steps));
+        // Where the fault has a name, it goes before what is only odd; a scanner that hangs head down looks like swapped wheels.
+        let fault = replay.steps.last().and_then(|step| step.update.wheel_fault);
+        if matches!(fault, None | Some(WheelFault::Swapped)) {
+            warnings.extend(odometry_against_scanner(log, robot, &replay.steps));
+        }
     } else if !said {
         let message = "the log has no odometry: the robot is followed by its scanner alone";
         warnings.push(Warning::new(NO_ODOMETRY, message));
+    }
+    warnings.extend(wheel_fault(&replay.steps));
+    if let Some(first) = replay.restarts_us.first() {
+        let at = at_s(&replay.steps, *first);
+        let n = replay.restarts_us.len();
+        let times = if n == 1 { "once".to_owned() } else { format!("{n} times") };
+        let message = format!(
+            "the counters restarted {times}, first {at:.1} s into the log: what the wheels did meanwhile is not known"
+        );
+        warnings.push(Warning::new("counters_restarted", message));
     }
     let looked_at: u32 =
         replay.steps.iter().map(|s| s.update.deskew).map(|d| d.points + d.no_echo + d.bad).sum();
@@ -58,7 +77,62 @@ pub fn of_drive(log: &Log, robot: &Robot, replay: &Replay) -> Vec<Warning> {
         );
         warnings.push(Warning::new("hardly_any_distances", message));
     }
+    warnings.extend(of_tracking(&Tracking::of(&replay.steps), !log.odometry.is_empty()));
     warnings
+}
+
+/// What the core itself found wrong.
+fn of_tracking(tracking: &Tracking, has_odometry: bool) -> Vec<Warning> {
+    let mut warnings = Vec::new();
+    match (tracking.first_useless_s, tracking.first_left_out_s) {
+        _ if !has_odometry => {}
+        // What was overruled before that is of the same kind, and no slip.
+        (Some(first_s), _) => {
+            let message = format!(
+                "the odometry was of no use in {} scans, first at t = {first_s:.1} s, and overruled in {} others: it did not tell of \
+                 the motion that the scanner saw, and the robot was followed by its scanner alone",
+                tracking.odometry_useless, tracking.odometry_left_out
+            );
+            warnings.push(Warning::new("odometry_useless", message));
+        }
+        (None, Some(first_s)) if tracking.odometry_left_out > FEW_LEFT_OUT => {
+            let message = format!(
+                "the wheels slipped or spun: in {} scans, first at t = {first_s:.1} s, the scanner overruled them",
+                tracking.odometry_left_out
+            );
+            warnings.push(Warning::new("odometry_slipped", message));
+        }
+        _ => {}
+    }
+    if let Some(first_s) = tracking.first_lost_s {
+        let message = format!(
+            "the robot was lost in {} scans, first at t = {first_s:.1} s: what they showed did not fit the map, or nothing was \
+             recognised for long. Poses from there on are not to be relied on until it is found again",
+            tracking.lost
+        );
+        warnings.push(Warning::new("tracking_lost", message));
+    }
+    warnings
+}
+
+/// The fault of the wheels that was seen for longest, if it was seen in more than a few scans.
+fn wheel_fault(steps: &[Step]) -> Option<Warning> {
+    let faults = || steps.iter().filter_map(|step| step.update.wheel_fault);
+    let scans = |fault| faults().filter(|f| *f == fault).count();
+    let fault = faults().max_by_key(|fault| scans(*fault))?;
+    let first = steps.iter().find(|step| step.update.wheel_fault == Some(fault))?;
+    if scans(fault) < LEAST_PAIRS {
+        return None;
+    }
+    let at = at_s(steps, first.stamp_us);
+    let message = format!("{} (seen from {at:.1} s into the log on)", fault.message());
+    Some(Warning::new("wheel_fault", message))
+}
+
+/// Seconds into the log.
+fn at_s(steps: &[Step], stamp_us: u64) -> f64 {
+    let first = steps.first().map_or(0, |step| step.stamp_us);
+    stamp_us.saturating_sub(first) as f64 * 1e-6
 }
 
 /// What wheels and scanner say against each other, if they do.

@@ -8,6 +8,7 @@ pub mod mcap;
 pub mod report;
 pub mod scan;
 pub mod svg;
+pub mod tracking;
 pub mod trajectory_csv;
 pub mod tum;
 

@@ -9,10 +9,11 @@ use slam_core::correction::Verdict;
 use slam_core::map::MapCounters;
 use slam_core::slam::Counters;
 
+use super::tracking::Tracking;
 use crate::log::{Log, Warning, doubts};
 use crate::replay::Replay;
 use crate::robot::Robot;
-use crate::sim::judge::{self, Judgement, TrajectoryErrors};
+use crate::sim::judge::{self, Judgement, LaidCorners, TrajectoryErrors};
 use crate::sim::world::World;
 use crate::sim::{Drive, SimConfig, UnitErrors};
 
@@ -41,6 +42,8 @@ pub struct Report {
     pub scan_us: Percentiles,
     /// Scans by what their pairs fixed.
     pub observability: BTreeMap<&'static str, usize>,
+    /// Scans by how far the pose was to be relied on, and what became of the odometry.
+    pub tracking: Tracking,
     /// Counters of the core.
     pub counters: Counters,
     /// Counters of the map.
@@ -95,10 +98,19 @@ impl SimulationReport {
             Some(error_m) => format!("{error_m:.3} m, {} of {} found", j.corners_found, j.corners),
             None => format!("none of {} found", j.corners),
         };
+        let laid = |laid: &LaidCorners| match laid.corner_error_m {
+            Some(error_m) => format!("{error_m:.3} m, {} of {} found", laid.corners_found, j.corners),
+            None => format!("none of {} found", j.corners),
+        };
+        let scaled = format!("{}, scale {:.4}", laid(&j.laid_with_scale), j.laid_with_scale.scale);
         let beside = |ours: f64, theirs: f64| format!("{ours:.3} m, dead reckoning {theirs:.3} m");
         vec![
             ("corner error, eq. (11)", corners),
+            ("laid over the blueprint", laid(&j.laid)),
+            ("and with scale", scaled),
             ("trajectory error, rmse", beside(j.trajectory.ate_rmse_m, dead.ate_rmse_m)),
+            ("unaligned", beside(j.trajectory.unaligned_rmse_m, dead.unaligned_rmse_m)),
+            ("aligned with scale", beside(j.trajectory.scaled_rmse_m, dead.scaled_rmse_m)),
             (
                 "final position error",
                 beside(j.trajectory.final_position_error_m, dead.final_position_error_m),
@@ -160,6 +172,7 @@ impl Report {
             duration_s: stamps.map_or(0.0, |(a, b)| (b.stamp_us - a.stamp_us) as f64 * 1e-6),
             scan_us: Percentiles::of(replay.steps.iter().map(|s| s.took)),
             observability,
+            tracking: Tracking::of(&replay.steps),
             counters: replay.counters,
             map_counters: replay.map_counters,
             slam_bytes: replay.slam_bytes,

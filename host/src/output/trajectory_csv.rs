@@ -19,6 +19,8 @@ struct Row {
     cov_yt_m_rad: f32,
     cov_tt_rad2: f32,
     state: &'static str,
+    fixed: &'static str,
+    odometry: &'static str,
     support: f32,
     residual_m: f32,
 }
@@ -38,6 +40,8 @@ pub fn render(steps: &[Step]) -> Result<Vec<u8>, csv::Error> {
         "cov_yt_m_rad",
         "cov_tt_rad2",
         "state",
+        "fixed",
+        "odometry",
         "support",
         "residual_m",
     ])?;
@@ -55,6 +59,8 @@ pub fn render(steps: &[Step]) -> Result<Vec<u8>, csv::Error> {
             cov_yt_m_rad: covariance[(1, 2)],
             cov_tt_rad2: covariance[(2, 2)],
             state: state(&step.update),
+            fixed: fixed(&step.update),
+            odometry: odometry(&step.update),
             // Without a minus before zero.
             support: step.update.support + 0.0,
             residual_m: step.update.residual_m,
@@ -63,16 +69,26 @@ pub fn render(steps: &[Step]) -> Result<Vec<u8>, csv::Error> {
     writer.into_inner().map_err(|e| e.into_error().into())
 }
 
-/// What became of a scan: `rejected` when it was not used, `uncorrected` when its pose is the odometry's, otherwise what
-/// its pairs fixed.
+/// How far the pose is to be relied on; `rejected` where the scan was not used.
 fn state(update: &SlamUpdate) -> &'static str {
-    if update.rejected.is_some() {
-        return "rejected";
-    }
+    if update.rejected.is_some() { "rejected" } else { update.state.name() }
+}
+
+/// What the pairs fixed; `uncorrected` where the pose is the odometry's.
+fn fixed(update: &SlamUpdate) -> &'static str {
     match update.observability.verdict {
         _ if !update.corrected => "uncorrected",
         Verdict::Full => "full",
         Verdict::Corridor => "corridor",
         Verdict::Blind => "blind",
+    }
+}
+
+/// What became of the odometry's motion: `left_out` where this scan overruled it, `useless` where it has been of no use for a while.
+fn odometry(update: &SlamUpdate) -> &'static str {
+    match update {
+        update if update.odometry_useless => "useless",
+        update if update.odometry_left_out => "left_out",
+        _ => "used",
     }
 }

@@ -10,6 +10,7 @@
 //!
 //! Everything is in f64, metres, radians and seconds; what is reported says its unit.
 
+mod laying;
 mod matching;
 mod reference;
 mod relations;
@@ -21,6 +22,7 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry2, Vector2};
 
+pub use laying::{lay, lay_with_scale};
 pub use matching::{Matched, at_stamps};
 pub use reference::{AgainstReference, Alignment, absolute_trajectory_error, against_reference, align};
 pub use relations::{

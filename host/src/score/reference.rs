@@ -1,7 +1,7 @@
 //! A trajectory against a reference: the absolute trajectory error of Sturm et al., "A Benchmark for the Evaluation of RGB-D
 //! SLAM Systems", IROS 2012, with one alignment in the plane.
 
-use nalgebra::{Isometry2, UnitComplex, Vector2};
+use nalgebra::{Isometry2, Vector2};
 use serde::{Serialize, Serializer};
 
 use super::matching::at_stamps;
@@ -35,24 +35,11 @@ pub fn absolute_trajectory_error(estimate: &[StampedPose], reference: &[StampedP
     align(estimate, reference).map(|a| a.rmse_m)
 }
 
-/// The rotation and the translation of least squares between positions that belong together. `None` of none.
+/// [`lay`](super::lay) of positions that belong together.
 fn lay(estimate: &[Isometry2<f64>], reference: &[StampedPose]) -> Option<Isometry2<f64>> {
-    let pairs =
-        || estimate.iter().map(|e| e.translation.vector).zip(reference.iter().map(StampedPose::position));
-    let n = pairs().count();
-    if n == 0 {
-        return None;
-    }
-    let mean_e = pairs().map(|p| p.0).sum::<Vector2<f64>>() / n as f64;
-    let mean_r = pairs().map(|p| p.1).sum::<Vector2<f64>>() / n as f64;
-    let (mut cos, mut sin) = (0.0, 0.0);
-    for (e, r) in pairs() {
-        let (e, r) = (e - mean_e, r - mean_r);
-        cos += e.dot(&r);
-        sin += e.x * r.y - e.y * r.x;
-    }
-    let rotation = UnitComplex::new(sin.atan2(cos));
-    Some(Isometry2::from_parts((mean_r - rotation * mean_e).into(), rotation))
+    let estimate: Vec<Vector2<f64>> = estimate.iter().map(|e| e.translation.vector).collect();
+    let reference: Vec<Vector2<f64>> = reference.iter().map(StampedPose::position).collect();
+    super::lay(&estimate, &reference)
 }
 
 /// All that a reference tells of a trajectory. Names and units in JSON are these, too.
@@ -120,6 +107,8 @@ pub fn against_reference(estimate: &[StampedPose], reference: &[StampedPose]) ->
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitComplex;
+
     use super::*;
 
     fn trajectory(carry: Isometry2<f64>) -> Vec<StampedPose> {

@@ -1,23 +1,17 @@
 //! How good a simulated robot's map and trajectory are, measured against the world and the truth.
 
-use nalgebra::{Isometry2, Matrix3, Point2, Vector2, Vector3};
+mod corners;
+
+use nalgebra::{Isometry2, Matrix3, Point2, Similarity2, Vector2, Vector3};
 use slam_core::{MapSegment, Segment};
 
 use super::Drive;
 use super::world::{Disc, Edge, World};
 use crate::replay::{ESTABLISHED_HITS, Replay, Step};
-use crate::score::{StampedPose, absolute_trajectory_error};
+use crate::score::{lay, lay_with_scale};
+use corners::Corners;
+pub use corners::LaidCorners;
 
-/// A map line stands for a blueprint wall when it passes this close to the corner, metres, …
-const WALL_DISTANCE_M: f64 = 0.35;
-/// … is this parallel to the wall, as the sine of the angle, …
-const WALL_SINE: f64 = 0.17;
-/// … and ends this close to the corner or beyond it, metres.
-const WALL_REACH_M: f64 = 1.0;
-/// Where a wall's side is looked at: this far along the wall from its corner and this far off it, metres.
-const SIDE_PROBE_M: [f64; 2] = [0.2, 0.02];
-/// Every so-manieth pose is asked what it saw.
-const SIGHTING_STEP: usize = 5;
 /// A segment farther than this from everything that stands still is spurious, metres.
 const SPURIOUS_M: f64 = 0.15;
 /// Pieces of a segment that are looked at, metres.
@@ -29,14 +23,19 @@ pub const NEES_INSTANTS: usize = 50;
 /// The measures of one simulated drive.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Judgement {
-    /// Equation (11): mean distance between the blueprint's corners and the crossings of the map's lines there, metres.
+    /// Equation (11): mean distance between the blueprint's corners and the crossings of the map's lines there, metres, in
+    /// the frame of the start.
     /// `None` where the world names no corner or the map has none of them.
     pub corner_error_m: Option<f64>,
     /// Corners of the blueprint that the map has.
     pub corners_found: usize,
     /// Corners of the blueprint.
     pub corners: usize,
-    /// Errors of the trajectory, in the frame of the start.
+    /// Equation (11) with the map laid over the blueprint by a rotation and a translation, as the paper lays it.
+    pub laid: LaidCorners,
+    /// The same by a scale, too: a scanner whose ranges are all too long cannot be told from wheels that are too small.
+    pub laid_with_scale: LaidCorners,
+    /// Errors of the trajectory.
     #[serde(flatten)]
     pub trajectory: TrajectoryErrors,
     /// Largest distance of a pose from the truth, metres, in the frame of the start.
@@ -63,7 +62,13 @@ pub struct Judgement {
 pub struct TrajectoryErrors {
     /// Root mean square position error after one SE(2) alignment, metres.
     pub ate_rmse_m: f64,
-    /// Distance of the last pose from the truth, metres.
+    /// The same in the frame of the start, without any alignment.
+    pub unaligned_rmse_m: f64,
+    /// The same after one alignment with scale.
+    pub scaled_rmse_m: f64,
+    /// By what that alignment scales the trajectory.
+    pub scale: f64,
+    /// Distance of the last pose from the truth, metres, in the frame of the start as all below.
     pub final_position_error_m: f64,
     /// Error of the last heading, degrees.
     pub final_heading_error_deg: f64,
@@ -73,16 +78,33 @@ pub struct TrajectoryErrors {
 
 /// Errors of poses that begin at the truth's start.
 pub fn trajectory_errors(truth: &[Isometry2<f64>], poses: &[Isometry2<f64>]) -> TrajectoryErrors {
-    let stamped = |poses: &[Isometry2<f64>]| -> Vec<StampedPose> {
-        poses.iter().enumerate().map(|(k, pose)| StampedPose { stamp_s: k as f64, pose: *pose }).collect()
+    let [onto, from] = [truth, poses].map(positions);
+    let rmse = |laid: Option<Similarity2<f64>>| {
+        let square = |(p, t): (&Vector2<f64>, &Vector2<f64>)| {
+            Some((laid? * Point2::from(*p) - Point2::from(*t)).norm_squared())
+        };
+        let squares: Option<Vec<f64>> = from.iter().zip(&onto).map(square).collect();
+        squares.map_or(f64::NAN, |s| (s.iter().sum::<f64>() / s.len() as f64).sqrt())
     };
+    let scaled = lay_with_scale(&from, &onto);
     let last = truth.last().zip(poses.last()).map(|(truth, pose)| truth.inv_mul(pose));
     TrajectoryErrors {
-        ate_rmse_m: absolute_trajectory_error(&stamped(poses), &stamped(truth)).unwrap_or(f64::NAN),
+        ate_rmse_m: rmse(lay(&from, &onto).map(rigid)),
+        unaligned_rmse_m: rmse(Some(Similarity2::identity())),
+        scaled_rmse_m: rmse(scaled),
+        scale: scaled.map_or(f64::NAN, |s| s.scaling()),
         final_position_error_m: last.map_or(f64::NAN, |off| off.translation.vector.norm()),
         final_heading_error_deg: last.map_or(f64::NAN, |off| off.rotation.angle().abs().to_degrees()),
         final_along_error_m: last.map_or(f64::NAN, |off| off.translation.x.abs()),
     }
+}
+
+fn positions(poses: &[Isometry2<f64>]) -> Vec<Vector2<f64>> {
+    poses.iter().map(|pose| pose.translation.vector).collect()
+}
+
+fn rigid(laid: Isometry2<f64>) -> Similarity2<f64> {
+    Similarity2::from_isometry(laid, 1.0)
 }
 
 /// The estimated poses in the world: `map` begins where the robot did.
@@ -106,15 +128,24 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
     let all_nees: Vec<f64> = (0..off.len()).filter_map(nees).collect();
     let last = off.len().saturating_sub(1);
     let map = map_in_world(drive, &replay.map);
-    let found = corner_errors(world, drive, &replay.map);
+    let corners = Corners::seen(world, drive);
+    let found = corners.find(&map);
+    let (from, onto) = (positions(&poses), positions(&drive.truth));
+    let by_path = [lay(&from, &onto).map(rigid), lay_with_scale(&from, &onto)];
+    let laid = |with_scale: bool| {
+        let starts = [Some(Similarity2::identity()), by_path[0], by_path[1].filter(|_| with_scale)];
+        corners.lay(&map, starts.into_iter().flatten(), with_scale)
+    };
     let (edges, discs) = (world.edges(), world.discs());
     let established: Vec<&Segment> =
         map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
     let covered = off.iter().zip(&covariances).filter(|(off, p)| off.along_m.powi(2) <= 4.0 * p.m11);
     Judgement {
-        corner_error_m: (!found.is_empty()).then(|| found.iter().sum::<f64>() / found.len() as f64),
+        corner_error_m: corners::mean_error_m(&found),
         corners_found: found.len(),
         corners: world.corners.len(),
+        laid: laid(false),
+        laid_with_scale: laid(true),
         trajectory: trajectory_errors(&drive.truth, &poses),
         worst_position_error_m: worst(|off| off.along_m.hypot(off.across_m)),
         worst_heading_error_deg: worst(|off| off.heading_rad.abs()).to_degrees(),
@@ -129,8 +160,8 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
 
 /// Equation (11), corner by corner, of those that the map has; metres, no alignment.
 pub fn corner_errors(world: &World, drive: &Drive, map: &[MapSegment]) -> Vec<f64> {
-    let map = map_in_world(drive, map);
-    world.corners.iter().filter_map(|c| corner_error(world, c.at.into(), drive, &map)).collect()
+    let found = Corners::seen(world, drive).find(&map_in_world(drive, map));
+    found.iter().map(corners::Found::error_m).collect()
 }
 
 /// The map's segments in the blueprint's frame.
@@ -174,69 +205,6 @@ fn covariance_in_base(drive: &Drive, step: &Step, truth: &Isometry2<f64>) -> Mat
     let start = drive.truth.first().copied().unwrap_or_else(Isometry2::identity);
     let turn = (truth.rotation.inverse() * start.rotation).to_rotation_matrix().to_homogeneous();
     turn * nalgebra::convert::<_, Matrix3<f64>>(step.update.covariance) * turn.transpose()
-}
-
-/// Distance between a corner of the blueprint and the crossing of the map's lines for the two walls that meet there.
-fn corner_error(world: &World, corner: Point2<f64>, drive: &Drive, map: &[MapSegment]) -> Option<f64> {
-    let walls = world.directions_at(corner);
-    let edges = world.edges();
-    let line = |wall: &Vector2<f64>| line_for(corner, wall, seen_side(corner, wall, &edges, drive)?, map);
-    let (a, b) = (line(walls.first()?)?, line(walls.get(1)?)?);
-    // n·p = d for both.
-    let denominator = a.0.perp(&b.0);
-    (denominator.abs() > 0.3).then(|| {
-        let x = (a.1 * b.0.y - b.1 * a.0.y) / denominator;
-        let y = (b.1 * a.0.x - a.1 * b.0.x) / denominator;
-        (Point2::new(x, y) - corner).norm()
-    })
-}
-
-/// Unit normal, on the side from which the robot saw it most, of the wall that leaves a corner in a direction. The two faces
-/// of a thin wall are two lines. `None` where it was never seen.
-fn seen_side(
-    corner: Point2<f64>,
-    wall: &Vector2<f64>,
-    edges: &[Edge],
-    drive: &Drive,
-) -> Option<Vector2<f64>> {
-    let normal = Vector2::new(-wall.y, wall.x);
-    let sightings = |normal: Vector2<f64>| {
-        let probe = corner + wall * SIDE_PROBE_M[0] + normal * SIDE_PROBE_M[1];
-        let sees = |pose: &&Isometry2<f64>| {
-            let to_probe = probe - Point2::from(pose.translation.vector);
-            let distance_m = to_probe.norm();
-            distance_m < super::scanner::REACH_M
-                && super::scanner::cast(pose.translation.vector.into(), to_probe / distance_m, edges, &[])
-                    .is_none_or(|hit| hit.range_m > distance_m)
-        };
-        drive.truth.iter().step_by(SIGHTING_STEP).filter(sees).count()
-    };
-    let (left, right) = (sightings(normal), sightings(-normal));
-    (left + right > 0).then(|| if left >= right { normal } else { -normal })
-}
-
-/// Normal and distance of the best-supported map line for a wall that leaves a corner in a direction, seen from a side.
-fn line_for(
-    corner: Point2<f64>,
-    wall: &Vector2<f64>,
-    side: Vector2<f64>,
-    map: &[MapSegment],
-) -> Option<(Vector2<f64>, f64)> {
-    let fits = |entry: &&MapSegment| {
-        let segment = &entry.segment;
-        let direction: Vector2<f64> = nalgebra::convert(segment.direction);
-        let ends: [Point2<f64>; 2] = [segment.start, segment.end].map(nalgebra::convert);
-        let ways = ends.map(|end| (end - corner).dot(wall));
-        let off = (ends[0] - corner).perp(&direction).abs();
-        direction.perp(wall).abs() < WALL_SINE
-            && nalgebra::convert::<_, Vector2<f64>>(segment.normal()).dot(&side) > 0.0
-            && off < WALL_DISTANCE_M
-            && ways[0].min(ways[1]) < WALL_REACH_M
-            && ways[0].max(ways[1]) > 0.1
-    };
-    let best = map.iter().filter(fits).max_by_key(|entry| entry.segment.moments.inliers)?;
-    let line = best.segment.line();
-    Some((nalgebra::convert(line.normal), f64::from(line.distance_m)))
 }
 
 /// Whether most of a segment lies far from everything that stands still. A wall that goes on behind a door is none, though its

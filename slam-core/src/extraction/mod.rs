@@ -6,17 +6,16 @@
 //! The paper (section 2.1) draws lines by RANSAC through all points of the scan and cuts them afterwards. The default
 //! cuts first: in scan order, at gaps and corners, so that no line can join what the scanner saw apart.
 
-pub mod ransac;
 pub mod split;
 mod strip;
 
 use heapless::VecView;
 use nalgebra::Point2;
 
-pub use ransac::RansacConfig;
 pub use split::SplitConfig;
 
 use crate::deskew::ScanPoint;
+use crate::paper::ransac::{self, RansacConfig};
 use crate::scan::SensorConfig;
 use crate::segment::Segment;
 

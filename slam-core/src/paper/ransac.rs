@@ -11,8 +11,8 @@ use nalgebra::Point2;
 use rand_core::{Rng, SeedableRng};
 use rand_pcg::Pcg32;
 
-use super::{Collector, MAX_SEGMENTS, Viewpoint};
 use crate::deskew::ScanPoint;
+use crate::extraction::{Collector, MAX_SEGMENTS, Viewpoint};
 use crate::math::sqrt;
 use crate::pose::perpendicular;
 use crate::segment::{Line, Moments, Segment};
@@ -33,7 +33,7 @@ pub struct RansacConfig {
     pub max_gap_m: f32,
     /// Fewest inliers of a segment.
     pub min_inliers: u16,
-    /// Seed of the draws, to which the scan's number is added.
+    /// Seed of the draws, to which the scan's number is added; see [`SlamConfig::with_ransac_seed`](crate::SlamConfig::with_ransac_seed).
     pub seed: u64,
 }
 
@@ -174,4 +174,43 @@ fn finish(run: &[Point2<f32>], view: &Viewpoint<'_>, config: &RansacConfig, out:
     let weight = 1.0 / view.sensor.noise.variance(0.0);
     let moments = Moments::from_points(run.iter().map(|&p| (p, weight)));
     out.push(Segment::fitted(moments, &[*first, *last], view.position));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::SlamConfig;
+    use crate::extraction::extract;
+    use std::vec::Vec as StdVec;
+
+    /// What is seen of two walls that meet, every point a little off.
+    fn corner() -> StdVec<ScanPoint> {
+        let off = |k: u16| 0.02 * (f32::from(k % 7) / 3.0 - 1.0);
+        let point = |k: u16| {
+            let along = f32::from(k % 60) * 0.05;
+            let position = if k < 60 {
+                Point2::new(3.0 + off(k), along - 3.0)
+            } else {
+                Point2::new(3.0 - along, off(k))
+            };
+            ScanPoint { position, range_m: position.coords.norm(), beam: k }
+        };
+        (0..120).map(point).collect()
+    }
+
+    fn segments(seed: u64, scan_number: u32) -> StdVec<Segment> {
+        let config = SlamConfig::paper().with_ransac_seed(seed);
+        let mut segments: Vec<Segment, MAX_SEGMENTS> = Vec::new();
+        extract(&corner(), &config.sensor, &config.extraction, scan_number, &mut segments);
+        segments.iter().copied().collect()
+    }
+
+    #[test]
+    fn another_seed_draws_other_lines_and_the_same_one_the_same() {
+        assert_eq!(segments(1, 7), segments(1, 7));
+        assert_ne!(segments(1, 7), segments(1_000_001, 7));
+        assert_ne!(segments(1, 7), segments(1, 8), "each scan has draws of its own");
+        let default = SlamConfig::default();
+        assert_eq!(default.with_ransac_seed(5), default, "nothing to draw");
+    }
 }

@@ -1,0 +1,499 @@
+//! From the prior to the hypothesis that explains the scan best.
+
+use heapless::Vec;
+use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
+
+use super::heading_search::{self, MAX_PEAKS};
+use super::hypothesis::{Hypothesis, tight_score};
+use crate::association::{AssociationConfig, Pair, Shortlist, View, associate};
+use crate::config::{ConfigError, SlamConfig, not_negative};
+use crate::correction::{
+    Correction, CorrectionConfig, GaussNewtonConfig, Prior, Standpoint, Verdict, maximum_a_posteriori,
+};
+use crate::extraction::MAX_SEGMENTS;
+use crate::map::MapSegment;
+use crate::math::{min, sin_cos, wrap_angle};
+use crate::nearby::Nearby;
+use crate::paper::least_squares::least_squares;
+use crate::pose::{components, perpendicular, pose};
+use crate::segment::Segment;
+use crate::slam::Stage;
+
+/// Settings of the search for a pose that explains more of a scan than the prediction does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct SearchConfig {
+    /// The search is made where the prediction explains less than this share of the scan.
+    pub below_score: f32,
+    /// How far turns reach to each side, radians, whatever the wheels say.
+    pub reach_rad: f32,
+    /// What the prior of a hypothesis is widened by: standard deviations of position (m) and heading (rad), …
+    pub widen: [f32; 2],
+    /// … and of the position, for each metre that the wheels report: they may have slipped.
+    pub widen_per_m: f32,
+    /// Standard deviations of a proposed pose, by which its first pairs are gated: position (m) and heading (rad).
+    pub proposed: [f32; 2],
+    /// Share of the scan that must be explained more for another pose to be taken, …
+    pub gain: f32,
+    /// … and segments, where the prediction explains at least [`Self::something_score`], …
+    pub more_segments: f32,
+    /// … or less.
+    pub more_segments_from_nothing: f32,
+    /// See there.
+    pub something_score: f32,
+    /// What a hypothesis loses for each unit of squared Mahalanobis distance from the prediction, in the widened prior.
+    pub loss_per_chi2: f32,
+    /// A turn by more than this from the prediction, radians, …
+    pub far_rad: f32,
+    /// … must explain this share of the scan, …
+    pub far_score: f32,
+    /// … or this where the prediction explains less than [`Self::nothing_score`].
+    pub far_score_from_nothing: f32,
+    /// See there.
+    pub nothing_score: f32,
+    /// The prior is left out where its squared Mahalanobis distance from what the scan says is larger than this.
+    pub wild_chi2: f32,
+    /// Or where it was larger than this, …
+    pub suspicious_chi2: f32,
+    /// … for so many scans in a row: wheels that slip drag the pose along little by little.
+    pub suspicious_scans: u8,
+    /// A lost robot is found where so much of the scan is explained, …
+    pub found_score: f32,
+    /// … and so many segments.
+    pub found_segments: f32,
+}
+
+impl SearchConfig {
+    /// Whether a hypothesis tells enough to be taken instead of the best known, so many radians from the prediction. One pair
+    /// fixes no pose, and a few short segments find something to lie on anywhere.
+    fn is_convincing(&self, hypothesis: &Hypothesis, best: &Hypothesis, turned_rad: f32) -> bool {
+        let more = if best.score > self.something_score {
+            self.more_segments
+        } else {
+            self.more_segments_from_nothing
+        };
+        let far = if best.score > self.nothing_score { self.far_score } else { self.far_score_from_nothing };
+        hypothesis.paired >= 2
+            && hypothesis.explained >= best.explained + more
+            && (turned_rad.abs() <= self.far_rad || hypothesis.score >= far)
+    }
+
+    /// What a hypothesis may be off by from the prediction after a motion: an error of the heading, made half before and half
+    /// after it, and one of the position.
+    fn widening(&self, moved: &Vector2<f32>) -> Matrix3<f32> {
+        let [position, heading] = self.widen;
+        let lever = perpendicular(*moved);
+        let (early, late) = (Vector3::new(lever.x, lever.y, 1.0), Vector3::new(0.0, 0.0, 1.0));
+        let by_way = self.widen_per_m * self.widen_per_m * moved.norm_squared();
+        variances([position, 0.0])
+            + Matrix3::from_diagonal(&Vector3::new(by_way, by_way, 0.0))
+            + (early * early.transpose() + late * late.transpose()) * (0.5 * heading * heading)
+    }
+
+    pub(crate) fn validate(&self) -> Result<(), ConfigError> {
+        let fields = [
+            ("correction.maximum_a_posteriori.search.below_score", self.below_score),
+            ("correction.maximum_a_posteriori.search.reach_rad", self.reach_rad),
+            ("correction.maximum_a_posteriori.search.widen", min(self.widen[0], self.widen[1])),
+            ("correction.maximum_a_posteriori.search.proposed", min(self.proposed[0], self.proposed[1])),
+            ("correction.maximum_a_posteriori.search.widen_per_m", self.widen_per_m),
+            ("correction.maximum_a_posteriori.search.more_segments", self.more_segments),
+            (
+                "correction.maximum_a_posteriori.search.more_segments_from_nothing",
+                self.more_segments_from_nothing,
+            ),
+            ("correction.maximum_a_posteriori.search.something_score", self.something_score),
+            ("correction.maximum_a_posteriori.search.gain", self.gain),
+            ("correction.maximum_a_posteriori.search.loss_per_chi2", self.loss_per_chi2),
+            ("correction.maximum_a_posteriori.search.far_rad", self.far_rad),
+            ("correction.maximum_a_posteriori.search.far_score", self.far_score),
+            ("correction.maximum_a_posteriori.search.far_score_from_nothing", self.far_score_from_nothing),
+            ("correction.maximum_a_posteriori.search.nothing_score", self.nothing_score),
+            ("correction.maximum_a_posteriori.search.wild_chi2", self.wild_chi2),
+            ("correction.maximum_a_posteriori.search.suspicious_chi2", self.suspicious_chi2),
+            ("correction.maximum_a_posteriori.search.found_score", self.found_score),
+            ("correction.maximum_a_posteriori.search.found_segments", self.found_segments),
+        ];
+        fields.into_iter().try_for_each(|(field, value)| not_negative(field, value))
+    }
+}
+
+/// A lost robot looks around so many places, one in the middle and the others on a ring of this radius, metres, and from each to
+/// so many sides.
+const PLACES: u8 = 9;
+const RING_M: f32 = 0.8;
+const SIDES: u8 = 6;
+const LOOKS: u8 = PLACES * SIDES;
+/// Larger Mahalanobis distances from the prediction take no more off a hypothesis.
+const MOST_CHI2: f32 = 100.0;
+/// Where the scan overrules the prior, the estimate's covariance before it is made to explain the difference d, as adaptive
+/// filters do (Mehra, "Approaches to adaptive filtering", IEEE TAC 1972): by so many times d·dᵀ, and at least by these standard
+/// deviations, metres and radians.
+const LEFT_OUT_FACTOR: f32 = 2.0;
+const LEFT_OUT_FLOOR: [f32; 2] = [0.02, 0.02];
+
+/// What is matched: a scan's segments in `base`, the map, and how.
+#[derive(Clone, Copy, Debug)]
+pub struct Scene<'a> {
+    /// Observed segments.
+    pub observed: &'a [Segment],
+    /// Map segments.
+    pub map: &'a [MapSegment],
+    /// The settings of all stages.
+    pub config: &'a SlamConfig,
+}
+
+/// The outcome of a scan.
+#[derive(Clone, Debug)]
+pub struct Tracked {
+    /// The winner.
+    pub hypothesis: Hypothesis,
+    /// Rounds of association and correction of all hypotheses.
+    pub iterations: u8,
+    /// Set where the prior was left out, as the scan says otherwise: by how much less sure the pose is to be taken before it,
+    /// covariance of (x, y, θ).
+    pub left_out: Option<Matrix3<f32>>,
+    /// Squared Mahalanobis distance of the prediction from what the scan says, three degrees of freedom.
+    pub innovation_chi2: f32,
+    /// Whether poses were searched for.
+    pub searched: bool,
+}
+
+/// The candidates among the map's lines, and the rounds through which hypotheses are made.
+///
+/// RAM: 2·`N` bytes and 1 KiB.
+#[derive(Clone, Debug, Default)]
+pub struct Tracker<const N: usize> {
+    /// Map segments that the scan can touch.
+    pub nearby: Nearby<N>,
+    /// Which observed segment is which map segment, as seen from the hypothesis looked at last.
+    pub pairs: Vec<Pair, MAX_SEGMENTS>,
+    shortlist: Shortlist,
+    iterations: u8,
+    /// Where a lost robot looks next.
+    looks: u8,
+    /// Predictions in a row that were suspiciously far off.
+    suspicious: u8,
+}
+
+impl<const N: usize> Tracker<N> {
+    /// No candidates.
+    pub const fn new() -> Self {
+        Self {
+            nearby: Nearby::new(),
+            pairs: Vec::new(),
+            shortlist: Shortlist::new(),
+            iterations: 0,
+            looks: 0,
+            suspicious: 0,
+        }
+    }
+
+    /// Finds the candidates: the map segments that a scan from this pose can touch and that count. The paper looks at all of them.
+    pub fn gather(
+        &mut self,
+        map: &[MapSegment],
+        pose: &Isometry2<f32>,
+        config: &SlamConfig,
+        counts: impl Fn(&MapSegment) -> bool,
+    ) {
+        let reach_m = match config.association {
+            AssociationConfig::Bisector(_) => f32::INFINITY,
+            AssociationConfig::Gated(_) => config.sensor.reach_m(),
+        };
+        self.nearby.gather(map, pose, reach_m, counts);
+        self.shortlist.clear();
+    }
+
+    /// The same of all map segments.
+    #[inline(never)]
+    pub fn gather_all(&mut self, scene: &Scene<'_>, pose: &Isometry2<f32>) {
+        self.gather(scene.map, pose, scene.config, |_| true);
+    }
+
+    /// The map's segments have new indices.
+    pub fn forget_shortlist(&mut self) {
+        self.shortlist.clear();
+    }
+
+    /// From the prior to the hypothesis that explains the scan best.
+    ///
+    /// Work: `max_iterations` rounds of association and correction for the prediction; where that explains too little, a
+    /// histogram, and for up to [`MAX_PEAKS`] peaks of it one vote and as many rounds.
+    pub fn track(
+        &mut self,
+        scene: &Scene<'_>,
+        previous: &Isometry2<f32>,
+        prior: &Prior,
+        watch: &mut impl FnMut(Stage),
+    ) -> Tracked {
+        watch(Stage::Association);
+        self.iterations = 0;
+        self.gather_all(scene, &prior.pose);
+        let mut tracked = Tracked {
+            hypothesis: Hypothesis::of_prior(prior),
+            iterations: 0,
+            left_out: None,
+            innovation_chi2: 0.0,
+            searched: false,
+        };
+        match &scene.config.correction {
+            CorrectionConfig::MaximumAPosteriori(config) => {
+                self.track_by_hypotheses(scene, previous, prior, config, &mut tracked, watch);
+            }
+            CorrectionConfig::LeastSquares(_) => {
+                let start = Hypothesis::of_prior(prior);
+                tracked.hypothesis = self.refined(scene, prior, start, Kernel::Strict, watch);
+            }
+        }
+        tracked.iterations = self.iterations;
+        tracked
+    }
+
+    fn track_by_hypotheses(
+        &mut self,
+        scene: &Scene<'_>,
+        previous: &Isometry2<f32>,
+        prior: &Prior,
+        config: &GaussNewtonConfig,
+        tracked: &mut Tracked,
+        watch: &mut impl FnMut(Stage),
+    ) {
+        let first = Kernel::first(prior, config);
+        let best = &mut tracked.hypothesis;
+        *best = self.refined(scene, prior, Hypothesis::of_prior(prior), first, watch);
+        tracked.innovation_chi2 = innovation_chi2(prior, best);
+        if self.nearby.all().is_empty() || scene.observed.is_empty() {
+            return;
+        }
+        let search = &config.search;
+        let moved = prior.pose.translation.vector - previous.translation.vector;
+        let broad = Prior { covariance: prior.covariance + search.widening(&moved), ..*prior };
+        let mut by_scan = false;
+        let suspicious = tracked.innovation_chi2 > search.suspicious_chi2;
+        self.suspicious = if suspicious { self.suspicious.saturating_add(1) } else { 0 };
+        let wild = tracked.innovation_chi2 > search.wild_chi2 || self.suspicious >= search.suspicious_scans;
+        if wild && best.observability.verdict == Verdict::Full {
+            let start = Hypothesis::at(best.pose, best.covariance);
+            let free = self.refined(scene, &broad, start, Kernel::Strict, watch);
+            if free.score >= best.score {
+                (*best, by_scan) = (free, true);
+            } else {
+                self.associate(scene, best);
+            }
+        }
+        tracked.searched = best.score < search.below_score;
+        if tracked.searched {
+            let other = self.refined(scene, prior, Hypothesis::of_prior(prior), first.other(), watch);
+            if other.score > best.score + search.gain {
+                (*best, by_scan) = (other, false);
+            }
+            if let Some(winner) = self.search(scene, &broad, best, search, watch) {
+                (*best, by_scan) = (winner, true);
+                self.gather_all(scene, &best.pose);
+            }
+            watch(Stage::Association);
+            self.associate(scene, best);
+        }
+        tracked.left_out = by_scan.then(|| left_out(&best.pose, &prior.pose));
+    }
+
+    /// Rounds of association and correction from a start.
+    #[inline(never)]
+    pub fn refined(
+        &mut self,
+        scene: &Scene<'_>,
+        prior: &Prior,
+        start: Hypothesis,
+        kernel: Kernel,
+        watch: &mut impl FnMut(Stage),
+    ) -> Hypothesis {
+        let mut hypothesis = start;
+        let (rounds, converged_step) = match &scene.config.correction {
+            CorrectionConfig::LeastSquares(_) => (1, f32::INFINITY),
+            CorrectionConfig::MaximumAPosteriori(config) => (config.max_iterations, config.converged_step),
+        };
+        for _ in 0..rounds {
+            watch(Stage::Association);
+            self.associate(scene, &hypothesis);
+            watch(Stage::Correction);
+            self.iterations = self.iterations.saturating_add(1);
+            let Some(correction) = step(scene, prior, &hypothesis, &self.pairs, kernel) else { break };
+            hypothesis.corrected |= !self.pairs.is_empty();
+            hypothesis.pose = correction.pose;
+            hypothesis.covariance = correction.covariance;
+            hypothesis.observability = correction.observability;
+            if correction.step <= converged_step {
+                break;
+            }
+        }
+        let line_noise = &scene.config.line_noise;
+        (hypothesis.score, hypothesis.explained) =
+            tight_score(scene.observed, &self.pairs, scene.map, &hypothesis.pose, line_noise);
+        hypothesis.paired = self.pairs.len() as u8;
+        hypothesis
+    }
+
+    /// Finds the pairs as seen from a hypothesis.
+    #[inline(never)]
+    pub fn associate(&mut self, scene: &Scene<'_>, hypothesis: &Hypothesis) {
+        let config = scene.config;
+        let view = View {
+            pose: &hypothesis.pose,
+            covariance: &hypothesis.covariance,
+            line_noise: &config.line_noise,
+        };
+        let (nearby, shortlist) = (&self.nearby, &mut self.shortlist);
+        associate(scene.observed, &view, scene.map, nearby, &config.association, shortlist, &mut self.pairs);
+    }
+
+    /// The best pose that the scan itself proposes, if it is so much better than the best known.
+    fn search(
+        &mut self,
+        scene: &Scene<'_>,
+        broad: &Prior,
+        best: &Hypothesis,
+        config: &SearchConfig,
+        watch: &mut impl FnMut(Stage),
+    ) -> Option<Hypothesis> {
+        let weight = broad.covariance.try_inverse()?;
+        let mut least = best.score + config.gain;
+        let mut winner = None;
+        self.propose(scene, broad, config, watch, &mut |hypothesis| {
+            let off = difference(&hypothesis.pose, &broad.pose);
+            let score = hypothesis.score - config.loss_per_chi2 * min(off.dot(&(weight * off)), MOST_CHI2);
+            if score > least && config.is_convincing(&hypothesis, best, off.z) {
+                (least, winner) = (score, Some(hypothesis));
+            }
+        });
+        winner
+    }
+
+    /// Looks for a lost robot near where it was thought to be: around one of [`LOOKS`] poses, another each time.
+    ///
+    /// Work: that of one search.
+    pub fn look_around(
+        &mut self,
+        scene: &Scene<'_>,
+        prior: &Prior,
+        watch: &mut impl FnMut(Stage),
+    ) -> Option<Hypothesis> {
+        let CorrectionConfig::MaximumAPosteriori(config) = &scene.config.correction else { return None };
+        let config = &config.search;
+        let c = components(&prior.pose);
+        let (place, side) = (self.looks % PLACES, self.looks / PLACES);
+        self.looks = (self.looks + 1) % LOOKS;
+        // In the middle, then on a ring.
+        let radius_m = if place == 0 { 0.0 } else { RING_M };
+        let (sin, cos) = sin_cos(f32::from(place) * (2.0 * core::f32::consts::PI / f32::from(PLACES - 1)));
+        let turn = f32::from(side) * (2.0 * core::f32::consts::PI / f32::from(SIDES));
+        let centre = pose(c.x + radius_m * cos, c.y + radius_m * sin, c.z + turn);
+        let broad = Prior { pose: centre, covariance: variances([RING_M, config.reach_rad]) };
+        let mut least = config.found_score;
+        let mut winner = None;
+        self.propose(scene, &broad, config, watch, &mut |hypothesis| {
+            if hypothesis.score > least && hypothesis.explained >= config.found_segments {
+                (least, winner) = (hypothesis.score, Some(hypothesis));
+            }
+        });
+        if let Some(winner) = &winner {
+            self.gather_all(scene, &winner.pose);
+            self.associate(scene, winner);
+        }
+        winner
+    }
+
+    /// Makes a hypothesis of each pose that the scan itself proposes around a prior.
+    fn propose(
+        &mut self,
+        scene: &Scene<'_>,
+        broad: &Prior,
+        config: &SearchConfig,
+        watch: &mut impl FnMut(Stage),
+        take: &mut dyn FnMut(Hypothesis),
+    ) {
+        let centre = components(&broad.pose);
+        let (observed, map) = (scene.observed, scene.map);
+        let turns: Vec<f32, MAX_PEAKS> =
+            heading_search::turns(observed, &broad.pose, map, &self.nearby, config.reach_rad);
+        for turn in turns {
+            let turned = pose(centre.x, centre.y, centre.z + turn);
+            let shift = heading_search::shift(observed, &turned, map, &self.nearby);
+            let proposed = pose(centre.x + shift.x, centre.y + shift.y, centre.z + turn);
+            let start = Hypothesis::at(proposed, variances(config.proposed));
+            take(self.refined(scene, broad, start, Kernel::Strict, watch));
+        }
+    }
+}
+
+fn step(
+    scene: &Scene<'_>,
+    prior: &Prior,
+    at: &Hypothesis,
+    pairs: &[Pair],
+    kernel: Kernel,
+) -> Option<Correction> {
+    let (observed, map, config) = (scene.observed, scene.map, scene.config);
+    match &config.correction {
+        CorrectionConfig::LeastSquares(least) => {
+            least_squares(observed, pairs, map, prior, config.sensor.noise.variance(0.0), least)
+        }
+        CorrectionConfig::MaximumAPosteriori(map_config) => {
+            let forgiven = (kernel == Kernel::Forgiving).then_some(&at.covariance);
+            let from = Standpoint { pose: &at.pose, forgiven };
+            maximum_a_posteriori(observed, pairs, map, prior, &from, &config.line_noise, map_config)
+        }
+    }
+}
+
+fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
+    Matrix3::from_diagonal(&Vector3::new(position * position, position * position, heading * heading))
+}
+
+/// By how much less sure a prior is to be taken that a scan overrules: covariance of (x, y, θ).
+pub(crate) fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
+    let off = difference(by_scan, prior);
+    off * off.transpose() * LEFT_OUT_FACTOR + variances(LEFT_OUT_FLOOR)
+}
+
+/// From the second pose to the first, (x, y, θ) in `map`.
+fn difference(to: &Isometry2<f32>, from: &Isometry2<f32>) -> Vector3<f32> {
+    let mut off = components(to) - components(from);
+    off.z = wrap_angle(off.z);
+    off
+}
+
+/// Squared Mahalanobis distance of the prediction from what the scan says. The correction that a Kalman update makes has the
+/// covariance P⁻ − P⁺.
+fn innovation_chi2(prior: &Prior, posterior: &Hypothesis) -> f32 {
+    let step = difference(&posterior.pose, &prior.pose);
+    // Directions in which the scan says nothing have none of it.
+    let floor = Matrix3::from_diagonal(&(0.01 * prior.covariance.diagonal()));
+    let gained = prior.covariance - posterior.covariance + floor;
+    gained.cholesky().map_or(0.0, |c| step.dot(&c.solve(&step)))
+}
+
+/// What the robust kernel holds against a pair.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kernel {
+    /// Its misfit: pairs that agree with the pose as it stands lead.
+    Strict,
+    /// What of its misfit the pose's own uncertainty does not explain: what most pairs agree on leads.
+    Forgiving,
+}
+
+impl Kernel {
+    /// The one to begin with.
+    fn first(prior: &Prior, config: &GaussNewtonConfig) -> Self {
+        let is_close = prior.covariance.m33 < config.close_heading_rad * config.close_heading_rad;
+        if is_close { Self::Forgiving } else { Self::Strict }
+    }
+
+    fn other(self) -> Self {
+        match self {
+            Self::Strict => Self::Forgiving,
+            Self::Forgiving => Self::Strict,
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! What came of a scan, and what has been counted since the start.
+
+use nalgebra::{Isometry2, Matrix3};
+
+use crate::correction::Observability;
+use crate::deskew::DeskewReport;
+use crate::extraction::ExtractionReport;
+use crate::loop_closure::Closure;
+use crate::map::MapCounters;
+use crate::registration::RegistrationReport;
+use crate::tracking::TrackingState;
+use crate::wheel_faults::WheelFault;
+
+/// What happened since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct Counters {
+    /// Scans processed, good or bad.
+    pub scans: u32,
+    /// Scans with another number of ranges than the geometry has beams.
+    pub wrong_beam_count: u32,
+    /// Motions with a number that was not finite; the robot was taken to stand still, unsure by a metre and a radian.
+    pub bad_motion: u32,
+    /// Scans in which no segment was found.
+    pub without_segments: u32,
+    /// Scans that left the pose to the odometry: no pair, or a system that could not be solved.
+    pub uncorrected: u32,
+    /// Moves by odometry alone, without a scan.
+    pub coasted: u32,
+    /// Loops closed.
+    pub loops_closed: u32,
+    /// Segments that one scan had too many.
+    pub crowded_out: u32,
+    /// Scans that overruled the odometry: an increment was wild, as of wheels that slip or spin.
+    pub odometry_left_out: u32,
+    /// Scans for which poses were searched.
+    pub searched: u32,
+    /// Scans at which the robot was lost.
+    pub lost: u32,
+}
+
+/// Why a scan was not used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[non_exhaustive]
+pub enum ScanRejection {
+    /// Another number of ranges than the geometry has beams.
+    WrongBeamCount {
+        /// Beams of the geometry.
+        expected: usize,
+        /// Ranges given.
+        actual: usize,
+    },
+}
+
+/// What the core is at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Stage {
+    /// Where the odometry leads.
+    Prediction,
+    /// Ranges to points.
+    Deskew,
+    /// Points to segments.
+    Extraction,
+    /// Segments to pairs.
+    Association,
+    /// Pairs to pose.
+    Correction,
+    /// Pairs to map.
+    Registration,
+}
+
+impl Stage {
+    /// All of them, in the order of the pipeline.
+    pub const ALL: [Self; 6] = [
+        Self::Prediction,
+        Self::Deskew,
+        Self::Extraction,
+        Self::Association,
+        Self::Correction,
+        Self::Registration,
+    ];
+    /// How many there are.
+    pub const COUNT: usize = Self::ALL.len();
+}
+
+/// Outcome of one scan.
+#[derive(Clone, Copy, Debug)]
+pub struct SlamUpdate {
+    /// Pose of `base` in `map` at the scan's middle beam.
+    pub pose: Isometry2<f32>,
+    /// Covariance of (x, y, θ), in `map`, the error of the map around the robot included.
+    pub covariance: Matrix3<f32>,
+    /// Where the odometry alone put the base, from the last pose.
+    pub predicted: Isometry2<f32>,
+    /// What became of the beams.
+    pub deskew: DeskewReport,
+    /// What was seen.
+    pub extraction: ExtractionReport,
+    /// What it did to the map.
+    pub registration: RegistrationReport,
+    /// Whether the pairs corrected the pose; otherwise it is the prediction.
+    pub corrected: bool,
+    /// Rounds of association and correction.
+    pub iterations: u8,
+    /// Share of the points on observed segments whose segment was recognised, 0 to 1.
+    pub support: f32,
+    /// Root mean square distance of the observed segments from their map lines after the correction, weighted by
+    /// inliers, metres. Zero without pairs.
+    pub residual_m: f32,
+    /// Share of the walls that should be seen from here and are seen through instead, 0 to 1.
+    pub contradicted_share: f32,
+    /// How far the pose is to be relied on.
+    pub state: TrackingState,
+    /// Whether the scan overruled the prediction: the odometry's increment was wild.
+    pub odometry_left_out: bool,
+    /// Whether the odometry has been of no use for a while, so that the scanner is followed alone.
+    pub odometry_useless: bool,
+    /// What is wrong with the wheels, where that is known.
+    pub wheel_fault: Option<WheelFault>,
+    /// Directions of the pose that the pairs fix.
+    pub observability: Observability,
+    /// Way driven until now, metres.
+    pub way_m: f32,
+    /// Set when this scan closed a loop, and with it the map was bent.
+    pub closure: Option<Closure>,
+    /// Set when the scan was not used. The motion still was.
+    pub rejected: Option<ScanRejection>,
+    /// Counters of the core, this scan included.
+    pub counters: Counters,
+    /// Counters of the map, this scan included.
+    pub map_counters: MapCounters,
+}
