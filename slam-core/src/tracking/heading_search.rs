@@ -108,7 +108,7 @@ fn peaks(votes: &[f32], reach_rad: f32) -> Vec<f32, MAX_PEAKS> {
 
 /// The shift (metres, in `map`) by which the segments seen from `from` lie on the map lines nearby best.
 ///
-/// Work: for each of the [`MAX_VOTERS`] largest segments and each map line that runs like it, the cells of a strip.
+/// Work: for each of the 16 largest segments and each map line that runs like it, the cells of a strip.
 pub fn shift<const N: usize>(
     observed: &[Segment],
     from: &Isometry2<f32>,

@@ -370,7 +370,7 @@ impl<const N: usize> Tracker<N> {
         winner
     }
 
-    /// Looks for a lost robot near where it was thought to be: around one of [`LOOKS`] poses, another each time.
+    /// Looks for a lost robot near where it was thought to be: around one of 54 poses, another each time.
     ///
     /// Work: that of one search.
     pub fn look_around(
