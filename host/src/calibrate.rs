@@ -314,7 +314,7 @@ fn windows(log: &Log, robot: &Robot, p: &Vector) -> Result<Vec<Window>, Calibrat
     let replay = replay::run(log, &looser, SlamConfig::default(), || {})?;
     // For most of the drive, or at its end: some seconds of slip are no fault.
     let faults = || replay.steps.iter().filter_map(|step| step.update.wheel_fault);
-    if let Some(fault) = replay.steps.last().and_then(|step| step.update.wheel_fault).or(faults().next_back())
+    if let Some(fault) = faults().next_back()
         && 4 * faults().filter(|f| *f == fault).count() > replay.steps.len()
     {
         return Err(CalibrationError::WheelFault { fault });

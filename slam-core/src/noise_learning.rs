@@ -6,13 +6,13 @@
 //!
 //! Both are variances of residuals, exponentially forgotten and bounded, as in adaptive Kalman filtering by covariance matching
 //! (Mehra, "Approaches to adaptive filtering", IEEE TAC 1972). The residuals contain the scanner's own noise, which is not taken
-//! out: the estimates err to the safe side.
+//! out; for lines a share of them is taken instead.
 
 use nalgebra::{Isometry2, Vector3};
 
 use crate::math::{max, min, sqrt, within};
 use crate::odometry::{Increment, OdometryNoise};
-use crate::pose::{components, log, pose};
+use crate::pose::{log, normalized};
 use crate::residual::LineNoise;
 
 /// Settings.
@@ -106,8 +106,8 @@ impl NoiseLearning {
     /// Takes in what the odometry said since the last scan, without its systematic errors.
     pub fn drive(&mut self, increment: &Increment) {
         if let Some((since, _)) = &mut self.since {
-            let c = components(&(since.before_from_after * increment.before_from_after));
-            *since = Increment { before_from_after: pose(c.x, c.y, c.z), ..since.then(increment) };
+            let next = since.then(increment);
+            *since = Increment { before_from_after: normalized(&next.before_from_after), ..next };
         }
     }
 

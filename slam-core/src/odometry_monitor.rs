@@ -11,7 +11,7 @@ use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::math::{max, sqrt};
 use crate::odometry::Increment;
-use crate::pose::{components, log, pose};
+use crate::pose::{log, normalized};
 
 /// Settings of the monitor.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -95,8 +95,8 @@ impl OdometryMonitor {
             *mean += (now - *mean) / SPEED_SCANS;
         }
         let [said, seen] = &mut self.piece;
-        *said = rebuilt(*said * by_odometry.before_from_after);
-        *seen = rebuilt(*seen * by_scanner);
+        *said = normalized(&(*said * by_odometry.before_from_after));
+        *seen = normalized(&(*seen * by_scanner));
         let (said, seen) = (log(said), log(seen));
         let square = |v: Vector3<f32>| v.x * v.x + v.y * v.y + RADIAN_M * RADIAN_M * v.z * v.z;
         let (difference, motion) = (square(said - seen), square(seen));
@@ -135,15 +135,10 @@ impl OdometryMonitor {
     }
 }
 
-/// From its components, so that the rotation stays a rotation however many steps there were.
-fn rebuilt(motion: Isometry2<f32>) -> Isometry2<f32> {
-    let c = components(&motion);
-    pose(c.x, c.y, c.z)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pose::pose;
 
     const CONFIG: MonitorConfig = MonitorConfig {
         min_score: 0.5,

@@ -7,7 +7,7 @@ use heapless::HistoryBuf;
 use nalgebra::Isometry2;
 
 use crate::odometry::Increment;
-use crate::pose::{exp, log};
+use crate::pose::{exp, log, normalized};
 use crate::scan::ScanGeometry;
 
 /// Number of instants, evenly spread from the first to the last beam, at which a scan's motion is given.
@@ -88,11 +88,7 @@ impl<const K: usize> OdometryTrack<K> {
             Some(last) if stamp_us <= last.stamp_us => {
                 return Err(StampNotIncreasing { last_us: last.stamp_us, actual_us: stamp_us });
             }
-            // Rebuilt from its components, so that the rotation stays a rotation however many steps there were.
-            Some(last) => {
-                let c = crate::pose::components(&(last.odom_from_base * step.before_from_after));
-                crate::pose::pose(c.x, c.y, c.z)
-            }
+            Some(last) => normalized(&(last.odom_from_base * step.before_from_after)),
             None => step.before_from_after,
         };
         self.knots.write(Knot { stamp_us, odom_from_base, step });

@@ -38,6 +38,21 @@ pub fn is_finite(pose: &Isometry2<f32>) -> bool {
         && pose.rotation.im.is_finite()
 }
 
+/// The pose rebuilt from its components, so that the rotation stays a rotation however many were multiplied.
+#[inline]
+pub fn normalized(pose: &Isometry2<f32>) -> Isometry2<f32> {
+    let c = components(pose);
+    self::pose(c.x, c.y, c.z)
+}
+
+/// `(x, y, θ)` of one pose less that of another; θ in (-π, π].
+#[inline]
+pub fn difference(to: &Isometry2<f32>, from: &Isometry2<f32>) -> Vector3<f32> {
+    let mut off = components(to) - components(from);
+    off.z = wrap_angle(off.z);
+    off
+}
+
 /// A vector turned by +90°: M·v with M = [[0, -1], [1, 0]] of the paper.
 #[inline]
 pub fn perpendicular(v: Vector2<f32>) -> Vector2<f32> {

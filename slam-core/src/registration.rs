@@ -14,10 +14,10 @@ use crate::extraction::MAX_SEGMENTS;
 use crate::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
 use crate::keyframe::KeyframeConfig;
 use crate::map::{MapSegment, SegmentMap};
-use crate::math::{max, min, wrap_angle};
+use crate::math::{max, min};
 use crate::nearby::Nearby;
 use crate::paper::end_points::EndPointsConfig;
-use crate::pose::{components, cross, is_finite};
+use crate::pose::{cross, difference, is_finite};
 use crate::residual::{LineNoise, Residual};
 use crate::segment::Segment;
 
@@ -161,9 +161,7 @@ pub struct Start<'a> {
 impl Start<'_> {
     /// From the prior's (x, y, θ) to the pose's.
     fn since_prior(&self) -> Vector3<f32> {
-        let mut since = components(self.pose) - components(self.prior);
-        since.z = wrap_angle(since.z);
-        since
+        difference(self.pose, self.prior)
     }
 }
 
@@ -477,6 +475,7 @@ fn distance_m(long: &Segment, short: &Segment) -> f32 {
 mod tests {
     use super::*;
     use crate::paper::end_points::{EndPointWeight, register_end_points};
+    use crate::pose::components;
     use crate::pose::{perpendicular, pose};
     use crate::segment::Moments;
     use nalgebra::{Matrix3, Vector3};

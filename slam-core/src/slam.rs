@@ -13,14 +13,14 @@ use crate::joint::Joint;
 use crate::keyframe::{AmongLines, Keyframe, KeyframeConfig, Settled};
 use crate::loop_closure::{Closure, LoopConfig, PendingClosure, drift};
 use crate::map::{MapSegment, SegmentMap};
-use crate::math::{max, sqrt, wrap_angle};
+use crate::math::{max, sqrt};
 use crate::noise_learning::NoiseLearning;
 use crate::odometry::Increment;
 use crate::odometry_bias::OdometryBias;
 use crate::odometry_monitor::OdometryMonitor;
 use crate::odometry_track::ScanMotion;
 use crate::paper::end_points::register_end_points;
-use crate::pose::{components, is_finite, perpendicular, pose, rotate_covariance};
+use crate::pose::{difference, is_finite, normalized, perpendicular, rotate_covariance};
 use crate::registration::{Eye, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start};
 use crate::scan::{Scan, SensorConfig};
 use crate::segment::Segment;
@@ -33,7 +33,7 @@ use crate::wheel_faults::{WheelFault, WheelMonitor};
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///
-/// RAM: [`Slam::BYTES`], about 68 bytes for each map segment, 16 for each beam and 30 KiB.
+/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 16 for each beam and 30 KiB.
 pub struct Slam<const N: usize, const BEAMS: usize = 682> {
     config: SlamConfig,
     map: SegmentMap<N>,
@@ -238,10 +238,10 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             if let Some(config) = self.config.loop_closure {
                 self.close_loop(&config, &mut update, watch);
             }
+            update.residual_m = self.residual_m(&update.pose);
             self.monitor_odometry(&by_odometry, &mut update);
             self.judge_state(scan, &motion.since_previous, &mut update);
             watch(Stage::Registration);
-            update.residual_m = self.residual_m(&update.pose);
             self.register(&mut update);
             if update.registration.keyframe {
                 self.forget(scan, &update);
@@ -292,8 +292,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if !is_finite(&self.map_from_base) || !self.local_covariance.iter().all(|v| v.is_finite()) {
             return false;
         }
-        let c = components(&self.map_from_base);
-        self.map_from_base = pose(c.x, c.y, c.z);
+        self.map_from_base = normalized(&self.map_from_base);
         for index in (0..self.map.segments().len()).rev() {
             if self.map.segments().get(index).is_some_and(|entry| !entry.segment.is_finite()) {
                 self.map.forget(index);
@@ -360,8 +359,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// Where an increment of the odometry leads from a pose.
     fn moved(&self, from: &Isometry2<f32>, increment: &Increment) -> Moved {
         let increment = self.odometry_bias().corrected(increment);
-        // Rebuilt from its components, so that the rotation stays a rotation however many steps there were.
-        let c = components(&(from * increment.before_from_after));
+        let pose = normalized(&(from * increment.before_from_after));
         let lever = perpendicular(from.rotation * increment.before_from_after.translation.vector);
         let mut by_pose = Matrix3::identity();
         (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
@@ -370,7 +368,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             noise += self.odometry.expected_covariance(config);
         }
         let noise = rotate_covariance(from, &noise);
-        Moved { pose: pose(c.x, c.y, c.z), by_pose, noise }
+        Moved { pose, by_pose, noise }
     }
 
     fn rejection(&self, scan: &Scan<'_>) -> Option<ScanRejection> {
@@ -575,7 +573,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
                 self.learning.fixed(&update.pose, update.observability.weak_sigma_m, learning);
             }
             if fixed {
-                self.learning.take_residual(self.residual_m(&update.pose), learning);
+                self.learning.take_residual(update.residual_m, learning);
             }
             self.config.line_noise = self.learning.line_noise(learning);
             self.config.odometry.noise = self.learning.odometry_noise();
@@ -697,7 +695,6 @@ struct Moved {
 
 /// Squared Mahalanobis distance between two poses.
 fn chi2_between(a: &Isometry2<f32>, b: &Isometry2<f32>, covariance: &Matrix3<f32>) -> f32 {
-    let mut off = components(a) - components(b);
-    off.z = wrap_angle(off.z);
+    let off = difference(a, b);
     covariance.try_inverse().map_or(0.0, |w| off.dot(&(w * off)))
 }

@@ -105,7 +105,8 @@ pub struct SlamUpdate {
     pub corrected: bool,
     /// Rounds of association and correction.
     pub iterations: u8,
-    /// Share of the points on observed segments whose segment was recognised, 0 to 1.
+    /// Share of the points on observed segments that the map explains, 0 to 1; see
+    /// [`tight_score`](crate::tracking::hypothesis::tight_score).
     pub support: f32,
     /// Root mean square distance of the observed segments from their map lines after the correction, weighted by
     /// inliers, metres. Zero without pairs.

@@ -92,10 +92,8 @@ fn measured(
     let facing = (laser_from_map.rotation * segment.normal()).dot(&point.coords) < 0.0;
     let distance = sqrt(point.coords.norm_squared());
     facing
-        && range_towards(&point.coords, scan, sensor).is_some_and(|range_m| {
-            let margin_m = config.margin_m + config.margin_sigmas * sqrt(sensor.noise.variance(range_m));
-            (range_m - distance).abs() <= margin_m
-        })
+        && range_towards(&point.coords, scan, sensor)
+            .is_some_and(|range_m| (range_m - distance).abs() <= margin_m(range_m, sensor, config))
 }
 
 /// Whether a segment has been seen through often enough to be forgotten.
@@ -120,9 +118,13 @@ fn seen_through(
             return false;
         }
         let Some(range_m) = range_towards(&point.coords, scan, sensor) else { return false };
-        let margin_m = config.margin_m + config.margin_sigmas * sqrt(sensor.noise.variance(range_m));
-        range_m > distance + margin_m
+        range_m > distance + margin_m(range_m, sensor, config)
     })
+}
+
+/// How far from a segment a beam of this range may end and have met it.
+fn margin_m(range_m: f32, sensor: &SensorConfig, config: &ForgetConfig) -> f32 {
+    config.margin_m + config.margin_sigmas * sqrt(sensor.noise.variance(range_m))
 }
 
 /// Range that the beam towards a point of `laser` measured, if it measured one.

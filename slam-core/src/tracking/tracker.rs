@@ -12,10 +12,10 @@ use crate::correction::{
 };
 use crate::extraction::MAX_SEGMENTS;
 use crate::map::MapSegment;
-use crate::math::{min, sin_cos, wrap_angle};
+use crate::math::{min, sin_cos};
 use crate::nearby::Nearby;
 use crate::paper::least_squares::least_squares;
-use crate::pose::{components, perpendicular, pose};
+use crate::pose::{components, difference, perpendicular, pose};
 use crate::segment::Segment;
 use crate::slam::Stage;
 
@@ -455,13 +455,6 @@ fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
 pub(crate) fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
     let off = difference(by_scan, prior);
     off * off.transpose() * LEFT_OUT_FACTOR + variances(LEFT_OUT_FLOOR)
-}
-
-/// From the second pose to the first, (x, y, θ) in `map`.
-fn difference(to: &Isometry2<f32>, from: &Isometry2<f32>) -> Vector3<f32> {
-    let mut off = components(to) - components(from);
-    off.z = wrap_angle(off.z);
-    off
 }
 
 /// Squared Mahalanobis distance of the prediction from what the scan says. The correction that a Kalman update makes has the
