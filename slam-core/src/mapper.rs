@@ -32,6 +32,9 @@ pub const UNSEEN: [f32; 3] = [0.02, 0.02, 0.02];
 /// The same where the reset came in the middle of a scan, and what the pose had in common with the walls is lost.
 pub const UNSEEN_IN_WORK: [f32; 3] = [0.05, 0.05, 0.05];
 
+/// How long a reset may take, microseconds: the wait of a watchdog and the boot, with room to spare. The wheels may go on turning.
+const RESET_US: u64 = 10_000_000;
+
 /// What happened to the odometry since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -148,7 +151,8 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
         let (left, right) = (ticks.left.wrapping_sub(last.left), ticks.right.wrapping_sub(last.right));
         let step = self.drive.increment(left, right, integration);
         // Across a reset time is not known.
-        let since_us = if self.resuming.is_some() { 0 } else { ticks.stamp_us.saturating_sub(last.stamp_us) };
+        let since_us =
+            if self.resuming.is_some() { RESET_US } else { ticks.stamp_us.saturating_sub(last.stamp_us) };
         if self.drive.is_possible(left, right, since_us) {
             return step;
         }
@@ -263,6 +267,24 @@ mod tests {
         let grown = mapper.slam().covariance() - before.1;
         assert!(grown.m11 > 3.9e-4 && grown.m33 > 3.9e-4, "{grown}");
         assert_eq!(mapper.counters().resumed, 1);
+    }
+
+    #[test]
+    fn what_the_wheels_turned_while_the_firmware_hung_is_motion() {
+        let mut mapper = mapper();
+        for k in 0..100 {
+            mapper.push(ticks(k));
+        }
+        mapper.coast(u64::MAX).unwrap();
+        let before = mapper.slam().pose().translation.x;
+        mapper.resume();
+        // 3 s at 0.31 m/s went by.
+        mapper.push(WheelTicks { stamp_us: 7, ..ticks(700) });
+        mapper.push(WheelTicks { stamp_us: 5_007, ..ticks(701) });
+        mapper.coast(u64::MAX).unwrap();
+        let moved = mapper.slam().pose().translation.x - before;
+        assert!((moved - 602.0 * STEP_M).abs() < 1e-3, "{moved}");
+        assert_eq!(mapper.counters().impossible_steps, 0);
     }
 
     #[test]
