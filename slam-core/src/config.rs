@@ -215,7 +215,7 @@ impl Default for SlamConfig {
                     spacing_between_m: 0.07,
                     min_score: 0.4,
                     scans_below: 6,
-                    way_below_m: 1.0,
+                    way_below_m: 1.6,
                 },
                 max_taken: 12,
                 max_learning: 6,

@@ -206,8 +206,13 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     ) -> SlamUpdate {
         // Without useful odometry the last motion is taken to go on.
         let by_odometry = motion.since_previous;
-        let expected = self.odometry.is_useless().then(|| motion.evenly(self.odometry.expected()));
-        let motion = expected.as_ref().unwrap_or(motion);
+        let instead = if self.odometry.is_useless() {
+            Some(self.odometry.expected())
+        } else {
+            self.odometry.made_up(&by_odometry)
+        };
+        let instead = instead.map(|increment| motion.evenly(increment));
+        let motion = instead.as_ref().unwrap_or(motion);
         let prior = self.predict(motion);
         let mut update = SlamUpdate {
             pose: prior.pose,
@@ -417,6 +422,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             update.odometry_left_out = true;
             update.pose = self.settle() * update.pose;
             self.loosen_joint(left_out);
+            // The joint estimate, too, goes on from where the scan says.
+            let moved = self.keyframe.map_from_base.inverse() * update.pose;
+            self.keyframe.since.before_from_after = normalized(&moved);
         }
     }
 
@@ -556,7 +564,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let fixed = update.support >= config.min_score && update.observability.verdict == Verdict::Full;
         if fixed && self.fixed {
             let by_scanner = self.map_from_base.inverse() * update.pose;
-            self.odometry.update(motion, &by_scanner, config);
+            self.odometry.update(motion, &by_scanner, update.odometry_left_out, config);
             if let Some(track_m) = self.config.odometry.track_m {
                 self.wheels.update(motion, &by_scanner, track_m);
             }
