@@ -140,8 +140,10 @@ impl OdometryMonitor {
     pub fn made_up(&self, by_odometry: &Increment) -> Option<Increment> {
         let (said, last) = (log(&by_odometry.before_from_after), log(&self.last));
         let [way, turn] = self.ahead;
-        let rest = Vector3::new(said.x + way, 0.0, said.z + turn);
-        let is_late = square(rest - last) < LATE_SHARE * square(said - last);
+        // As an arc, too, so that both are compared by the same measure.
+        let arc = Vector3::new(said.x, 0.0, said.z);
+        let rest = arc + Vector3::new(way, 0.0, turn);
+        let is_late = square(rest - last) < LATE_SHARE * square(arc - last);
         is_late.then(|| Increment::from_motion(exp(&rest)))
     }
 
@@ -235,6 +237,9 @@ mod tests {
         let rest = monitor.made_up(&Increment::from_motion(late)).unwrap();
         assert!((rest.before_from_after.inverse() * step).translation.vector.norm() < 1e-5);
         assert!((rest.distance_m - 0.15).abs() < 2e-3 && (rest.turn_rad - 0.2).abs() < 1e-5);
+        // Nothing is made up for where nothing is owed, however far the motion.
+        let far = Increment::from_motion(pose(0.0, 39.0, 0.0));
+        assert_eq!(OdometryMonitor::default().made_up(&far), None);
         // A wheel that spun while the robot stood makes up for nothing.
         let mut monitor = OdometryMonitor::default();
         let spin = Increment::from_motion(pose(0.2, 0.0, 0.0));
