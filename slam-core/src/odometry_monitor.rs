@@ -89,22 +89,21 @@ impl OdometryMonitor {
         if self.motion > 0.0 { self.difference / self.motion } else { 0.0 }
     }
 
-    /// Takes in the motion since the scan before, by the odometry and by the scanner, where the scans fixed both poses, and whether
-    /// the odometry was left out of this one.
-    pub fn update(
-        &mut self,
-        by_odometry: &Increment,
-        by_scanner: &Isometry2<f32>,
-        left_out: bool,
-        config: &MonitorConfig,
-    ) {
+    /// Takes in the motion since the scan before, by the odometry and as it came out, whether a scan fixed it or not, and whether
+    /// both agree.
+    pub fn account(&mut self, by_odometry: &Increment, moved: &Isometry2<f32>, agree: bool) {
+        let (said, moved) = (log(&by_odometry.before_from_after), log(moved));
+        let [way, turn] = [self.ahead[0] + said.x - moved.x, self.ahead[1] + said.z - moved.z];
+        self.ahead = if agree || !(way + turn).is_finite() { [0.0; 2] } else { [way, turn] };
+    }
+
+    /// Takes in the motion since the scan before, by the odometry and by the scanner, where the scans fixed both poses.
+    pub fn update(&mut self, by_odometry: &Increment, by_scanner: &Isometry2<f32>, config: &MonitorConfig) {
         if !(by_odometry.is_finite() && crate::pose::is_finite(by_scanner)) {
             return;
         }
         self.last = *by_scanner;
-        let (said, seen) = (log(&by_odometry.before_from_after), log(by_scanner));
-        let [way, turn] = self.ahead;
-        self.ahead = if left_out { [way + said.x - seen.x, turn + said.z - seen.z] } else { [0.0; 2] };
+        let seen = log(by_scanner);
         let [position, heading] = [seen.x * seen.x + seen.y * seen.y, seen.z * seen.z];
         for (mean, now) in self.speed.iter_mut().zip([position, heading]) {
             *mean += (now - *mean) / SPEED_SCANS;
@@ -132,7 +131,6 @@ impl OdometryMonitor {
     pub fn lost_sight(&mut self) {
         self.last = Isometry2::identity();
         self.piece = [Isometry2::identity(); 2];
-        self.ahead = [0.0; 2];
     }
 
     /// What remains of an increment that makes up for motion which was not reported, and which the scanner has seen since: an
@@ -183,7 +181,7 @@ mod tests {
 
     fn drive(monitor: &mut OdometryMonitor, said: [f32; 3], seen: [f32; 3], scans: usize) {
         let increment = Increment::from_motion(pose(said[0], said[1], said[2]));
-        (0..scans).for_each(|_| monitor.update(&increment, &pose(seen[0], seen[1], seen[2]), false, &CONFIG));
+        (0..scans).for_each(|_| monitor.update(&increment, &pose(seen[0], seen[1], seen[2]), &CONFIG));
     }
 
     #[test]
@@ -230,7 +228,8 @@ mod tests {
         let mut late = step;
         for _ in 0..4 {
             assert_eq!(monitor.made_up(&still), None);
-            monitor.update(&still, &step, true, &CONFIG);
+            monitor.update(&still, &step, &CONFIG);
+            monitor.account(&still, &step, false);
             late *= step;
         }
         // Four steps that were not reported and the one at hand.
@@ -244,7 +243,8 @@ mod tests {
         let mut monitor = OdometryMonitor::default();
         let spin = Increment::from_motion(pose(0.2, 0.0, 0.0));
         for _ in 0..4 {
-            monitor.update(&spin, &Isometry2::identity(), true, &CONFIG);
+            monitor.update(&spin, &Isometry2::identity(), &CONFIG);
+            monitor.account(&spin, &Isometry2::identity(), false);
         }
         assert_eq!(monitor.made_up(&still), None);
         assert_eq!(monitor.made_up(&Increment::from_motion(pose(0.05, 0.0, 0.0))), None);

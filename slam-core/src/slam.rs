@@ -562,9 +562,10 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     fn monitor_odometry(&mut self, motion: &Increment, update: &mut SlamUpdate) {
         let Some(config) = &self.config.odometry.monitor else { return };
         let fixed = update.support >= config.min_score && update.observability.verdict == Verdict::Full;
+        let by_scanner = self.map_from_base.inverse() * update.pose;
+        self.odometry.account(motion, &by_scanner, fixed && !update.odometry_left_out);
         if fixed && self.fixed {
-            let by_scanner = self.map_from_base.inverse() * update.pose;
-            self.odometry.update(motion, &by_scanner, update.odometry_left_out, config);
+            self.odometry.update(motion, &by_scanner, config);
             if let Some(track_m) = self.config.odometry.track_m {
                 self.wheels.update(motion, &by_scanner, track_m);
             }
