@@ -1,6 +1,6 @@
 //! All settings, one struct for each stage, and where each value comes from.
 
-use nalgebra::Isometry2;
+use nalgebra::{Isometry2, Vector3};
 
 use crate::association::{AssociationConfig, GateConfig};
 use crate::correction::{CorrectionConfig, GaussNewtonConfig};
@@ -38,6 +38,13 @@ pub struct OdometryConfig {
     pub track_m: Option<f32>,
     /// Check against the scanner, or none.
     pub monitor: Option<MonitorConfig>,
+}
+
+impl OdometryConfig {
+    /// Standard deviations of the systematic errors before anything is learnt; zero where they are not to be.
+    pub(crate) fn bias_sigmas(&self) -> Vector3<f32> {
+        self.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas())
+    }
 }
 
 /// Everything [`Slam`](crate::Slam) can be told.

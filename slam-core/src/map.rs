@@ -136,6 +136,15 @@ impl<const N: usize> SegmentMap<N> {
         self.counters.fused = self.counters.fused.saturating_add(1);
     }
 
+    /// Forgets the segments that are not finite.
+    pub(crate) fn forget_broken(&mut self) {
+        for index in (0..self.segments.len()).rev() {
+            if self.segments.get(index).is_some_and(|entry| !entry.segment.is_finite()) {
+                self.forget(index);
+            }
+        }
+    }
+
     /// Forgets a segment; the last one takes its place.
     pub(crate) fn forget(&mut self, index: usize) {
         if index < self.segments.len() {

@@ -159,6 +159,8 @@ impl OdometryNoise {
     ///
     /// Heading errors are taken as spread evenly over the way: they move the end sideways, with the covariance
     /// d/2 and d²/3 of integrated white noise.
+    // Not inlined: on the microcontroller that is less flash.
+    #[inline(never)]
     pub fn covariance(&self, increment: &Increment) -> Matrix3<f32> {
         let (d, turn) = (increment.distance_m, increment.turn_rad);
         let square = |v: f32| v * v;

@@ -10,6 +10,7 @@ use heapless::Vec;
 use nalgebra::{Isometry2, Point2, Vector3};
 
 use crate::association::Pair;
+use crate::config::SlamConfig;
 use crate::extraction::MAX_SEGMENTS;
 use crate::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
 use crate::keyframe::KeyframeConfig;
@@ -35,6 +36,16 @@ pub enum RegistrationConfig {
     EndPoints(EndPointsConfig),
     /// Lines are estimated together with the pose, walls fused.
     Joint(JointConfig),
+}
+
+impl RegistrationConfig {
+    /// Settings of the joint estimate, where there is one.
+    pub(crate) fn joint(&self) -> Option<&JointConfig> {
+        match self {
+            Self::EndPoints(_) => None,
+            Self::Joint(config) => Some(config),
+        }
+    }
 }
 
 /// Settings of the joint estimate.
@@ -133,6 +144,12 @@ pub struct Eye {
     pub reach_m: f32,
     /// Errors of lines beyond their points' noise.
     pub line_noise: LineNoise,
+}
+
+impl Eye {
+    pub(crate) fn of(config: &SlamConfig) -> Self {
+        Self { reach_m: config.sensor.reach_m(), line_noise: config.line_noise }
+    }
 }
 
 impl Observed<'_> {

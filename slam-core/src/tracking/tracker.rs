@@ -217,6 +217,27 @@ impl<const N: usize> Tracker<N> {
         self.shortlist.clear();
     }
 
+    /// The same as [`Self::track`] for a robot that may be lost: where the scan is not explained well then, it looks around.
+    pub fn locate(
+        &mut self,
+        scene: &Scene<'_>,
+        previous: &Isometry2<f32>,
+        prior: &Prior,
+        is_lost: bool,
+        watch: &mut impl FnMut(Stage),
+    ) -> Tracked {
+        let mut tracked = self.track(scene, previous, prior, watch);
+        if is_lost && tracked.hypothesis.score < scene.config.state.good_score {
+            if let Some(found) = self.look_around(scene, prior, watch) {
+                tracked.left_out = Some(left_out(&found.pose, &prior.pose));
+                tracked.hypothesis = found;
+            } else {
+                self.associate(scene, &tracked.hypothesis);
+            }
+        }
+        tracked
+    }
+
     /// From the prior to the hypothesis that explains the scan best.
     ///
     /// Work: `max_iterations` rounds of association and correction for the prediction; where that explains too little, a
@@ -452,7 +473,7 @@ fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
 }
 
 /// By how much less sure a prior is to be taken that a scan overrules: covariance of (x, y, θ).
-pub(crate) fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
+fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
     let off = difference(by_scan, prior);
     off * off.transpose() * LEFT_OUT_FACTOR + variances(LEFT_OUT_FLOOR)
 }
