@@ -4,29 +4,29 @@
 //! its covariance, and a map that is moved with it.
 //!
 //! Scan by scan the pose is tracked among lines that stand still; the local covariance is its own error among them. Of
-//! [`keyframe`](crate::keyframe)s an extended Kalman filter, the [`Joint`] estimate, takes in what was seen, a few sightings with
+//! [`keyframe`](crate::ekf::keyframe)s an extended Kalman filter, the [`Joint`] estimate, takes in what was seen, a few sightings with
 //! each scan, and gathers in its error state what they say of pose, odometry and lines. [`Estimator::commit`] injects the error
 //! state: pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
 
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::SlamConfig;
-use crate::correction::Prior;
-use crate::joint::Joint;
-use crate::keyframe::{AmongLines, Keyframe, KeyframeConfig, Settled};
+use crate::ekf::joint::Joint;
+use crate::ekf::keyframe::{AmongLines, Keyframe, KeyframeConfig, Settled};
+use crate::ekf::registration::{
+    Eye, JointConfig, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start,
+};
+use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covariance};
+use crate::geometry::residual::LineNoise;
+use crate::geometry::segment::Segment;
 use crate::loop_closure::Closure;
 use crate::map::SegmentMap;
 use crate::odometry::Increment;
-use crate::odometry_bias::OdometryBias;
-use crate::odometry_health::OdometryHealth;
-use crate::odometry_track::ScanMotion;
+use crate::odometry::bias::OdometryBias;
+use crate::odometry::health::OdometryHealth;
+use crate::odometry::track::ScanMotion;
 use crate::paper::end_points::register_end_points;
-use crate::pose::{is_finite, normalized, perpendicular, rotate_covariance};
-use crate::registration::{
-    Eye, JointConfig, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start,
-};
-use crate::residual::LineNoise;
-use crate::segment::Segment;
+use crate::tracking::correction::Prior;
 use crate::tracking::{Hypothesis, Tracker, TrackingState};
 use crate::update::SlamUpdate;
 
@@ -389,7 +389,7 @@ impl Estimator {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::{components, difference, pose};
+    use crate::geometry::pose::{components, difference, pose};
     use nalgebra::Point2;
 
     /// All that an estimator works with, around a robot that has seen nothing.
@@ -476,7 +476,7 @@ mod tests {
         let at_first = robot.map.segments()[0].segment;
         // Two decimetres by the odometry, and a centimetre more by the wall.
         assert!(robot.go(0.1, 0.0, 0.0) && robot.go(0.1, 0.0, 0.0));
-        robot.tracker.pairs.push(crate::association::Pair { observed: 0, mapped: 0 }).unwrap();
+        robot.tracker.pairs.push(crate::tracking::association::Pair { observed: 0, mapped: 0 }).unwrap();
         let seen = wall().transformed(&pose(-0.21, 0.0, 0.0));
         assert_eq!(robot.see(&[seen]).matched, 1);
         assert_eq!(robot.map.segments()[0].segment.midpoint(), at_first.midpoint(), "not yet");

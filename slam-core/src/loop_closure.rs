@@ -10,12 +10,12 @@
 
 use nalgebra::{Isometry2, Matrix3, Vector2};
 
-use crate::correction::{Observability, Prior, Verdict};
 use crate::estimator::{Estimator, Surroundings};
+use crate::geometry::math::{max, min, sin_cos, wrap_angle};
+use crate::geometry::pose::{components, difference, pose};
 use crate::map::MapSegment;
-use crate::math::{max, min, sin_cos, wrap_angle};
-use crate::pose::{components, difference, pose};
 use crate::tracking::Hypothesis;
+use crate::tracking::correction::{Observability, Prior, Verdict};
 use crate::tracking::tracker::{Kernel, Scene};
 use crate::update::Stage;
 
@@ -196,7 +196,7 @@ impl Closure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::segment::Segment;
+    use crate::geometry::segment::Segment;
     use nalgebra::Point2;
 
     fn entry(x: f32, seen_at_m: f32) -> MapSegment {

@@ -5,20 +5,20 @@ mod access;
 use nalgebra::{Isometry2, Matrix3};
 
 use crate::config::SlamConfig;
-use crate::correction::Prior;
 use crate::estimator::{Estimator, Surroundings};
 use crate::frontend::Frontend;
 use crate::loop_closure::LoopCloser;
+use crate::map::visibility::{is_gone, mark_seen_through};
 use crate::map::{MapSegment, SegmentMap};
 use crate::odometry::Increment;
-use crate::odometry_health::{OdometryHealth, ScanEvidence};
-use crate::odometry_track::ScanMotion;
-use crate::scan::Scan;
+use crate::odometry::health::{OdometryHealth, ScanEvidence};
+use crate::odometry::track::ScanMotion;
+use crate::sensor::scan::Scan;
+use crate::tracking::correction::Prior;
 use crate::tracking::state::StateMonitor;
 use crate::tracking::tracker::Scene;
 use crate::tracking::{Tracker, TrackingState};
 pub use crate::update::{Counters, ScanRejection, SlamUpdate, Stage};
-use crate::visibility::{is_gone, mark_seen_through};
 
 /// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
 ///

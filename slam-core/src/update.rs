@@ -2,16 +2,16 @@
 
 use nalgebra::{Isometry2, Matrix3};
 
-use crate::correction::{Observability, Prior};
-use crate::deskew::DeskewReport;
-use crate::extraction::ExtractionReport;
+use crate::ekf::registration::RegistrationReport;
+use crate::frontend::deskew::DeskewReport;
+use crate::frontend::extraction::ExtractionReport;
 use crate::loop_closure::Closure;
 use crate::map::MapCounters;
-use crate::registration::RegistrationReport;
-use crate::scan::{Scan, ScanGeometry};
+use crate::odometry::wheel_faults::WheelFault;
+use crate::sensor::scan::{Scan, ScanGeometry};
 use crate::tracking::TrackingState;
+use crate::tracking::correction::{Observability, Prior};
 use crate::tracking::tracker::Tracked;
-use crate::wheel_faults::WheelFault;
 
 /// What happened since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

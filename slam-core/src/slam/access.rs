@@ -6,19 +6,19 @@ use nalgebra::{Isometry2, Matrix3};
 
 use super::Slam;
 use crate::config::{ConfigError, SlamConfig};
-use crate::deskew::ScanPoint;
 use crate::estimator::Estimator;
 use crate::frontend::Frontend;
+use crate::frontend::deskew::ScanPoint;
+use crate::geometry::segment::Segment;
 use crate::loop_closure::LoopCloser;
 use crate::map::SegmentMap;
-use crate::odometry_bias::OdometryBias;
-use crate::odometry_health::OdometryHealth;
-use crate::scan::SensorConfig;
-use crate::segment::Segment;
+use crate::odometry::bias::OdometryBias;
+use crate::odometry::health::OdometryHealth;
+use crate::odometry::wheel_faults::WheelFault;
+use crate::sensor::scan::SensorConfig;
 use crate::tracking::state::StateMonitor;
 use crate::tracking::{Tracker, TrackingState};
 use crate::update::Counters;
-use crate::wheel_faults::WheelFault;
 
 impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// Size in RAM.

@@ -5,10 +5,10 @@ use nalgebra::Isometry2;
 use super::Tracker;
 use super::state::Evidence;
 use super::tracker::Scene;
-use crate::math::sqrt;
+use crate::geometry::math::sqrt;
+use crate::map::visibility::confirmed_and_contradicted;
 use crate::odometry::Increment;
-use crate::scan::Scan;
-use crate::visibility::confirmed_and_contradicted;
+use crate::sensor::scan::Scan;
 
 impl<const N: usize> Tracker<N> {
     /// Root mean square distance of the observed segments from their map lines, seen from this pose and weighted by inliers, metres. Zero

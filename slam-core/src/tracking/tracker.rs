@@ -5,19 +5,19 @@ use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 use super::heading_search::{self, MAX_PEAKS};
 use super::hypothesis::{Hypothesis, tight_score};
-use crate::association::{AssociationConfig, Pair, Shortlist, View, associate};
 use crate::config::{ConfigError, SlamConfig, not_negative};
-use crate::correction::{
+use crate::frontend::extraction::MAX_SEGMENTS;
+use crate::geometry::math::{min, sin_cos};
+use crate::geometry::pose::{components, difference, perpendicular, pose};
+use crate::geometry::segment::Segment;
+use crate::map::MapSegment;
+use crate::map::nearby::Nearby;
+use crate::paper::least_squares::least_squares;
+use crate::slam::Stage;
+use crate::tracking::association::{AssociationConfig, Pair, Shortlist, View, associate};
+use crate::tracking::correction::{
     Correction, CorrectionConfig, GaussNewtonConfig, Prior, Standpoint, Verdict, maximum_a_posteriori,
 };
-use crate::extraction::MAX_SEGMENTS;
-use crate::map::MapSegment;
-use crate::math::{min, sin_cos};
-use crate::nearby::Nearby;
-use crate::paper::least_squares::least_squares;
-use crate::pose::{components, difference, perpendicular, pose};
-use crate::segment::Segment;
-use crate::slam::Stage;
 
 /// Settings of the search for a pose that explains more of a scan than the prediction does.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -3,10 +3,13 @@
 //! When it is full, the segment that is worth least gives way to the new one: scans that saw it, fewer the longer the way since.
 //! Segments of the scan at hand never do. Each eviction and each segment refused is counted.
 
+pub mod nearby;
+pub mod visibility;
+
 use heapless::Vec;
 
-use crate::math::max;
-use crate::segment::Segment;
+use crate::geometry::math::max;
+use crate::geometry::segment::Segment;
 
 /// A segment of the map, 64 bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,13 +1,16 @@
 //! A scan as the map's stages want it: ranges to points in `base`, points to segments.
 
+pub mod deskew;
+pub mod extraction;
+
 use heapless::Vec;
 
 use crate::config::SlamConfig;
-use crate::deskew::{DeskewReport, ScanPoint, deskew};
-use crate::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
-use crate::odometry_track::ScanMotion;
-use crate::scan::Scan;
-use crate::segment::Segment;
+use crate::frontend::deskew::{DeskewReport, ScanPoint, deskew};
+use crate::frontend::extraction::{ExtractionReport, MAX_SEGMENTS, extract};
+use crate::geometry::segment::Segment;
+use crate::odometry::track::ScanMotion;
+use crate::sensor::scan::Scan;
 use crate::update::Stage;
 
 /// Points and segments of the scan at hand, in `base` at its middle beam.

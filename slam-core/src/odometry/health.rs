@@ -6,14 +6,14 @@
 use nalgebra::{Isometry2, Matrix3};
 
 use crate::config::{OdometryConfig, SlamConfig};
-use crate::correction::{Observability, Verdict};
-use crate::noise_learning::NoiseLearning;
+use crate::geometry::residual::LineNoise;
+use crate::odometry::bias::OdometryBias;
+use crate::odometry::monitor::OdometryMonitor;
+use crate::odometry::noise_learning::NoiseLearning;
+use crate::odometry::track::ScanMotion;
+use crate::odometry::wheel_faults::{WheelFault, WheelMonitor};
 use crate::odometry::{Increment, OdometryNoise};
-use crate::odometry_bias::OdometryBias;
-use crate::odometry_monitor::OdometryMonitor;
-use crate::odometry_track::ScanMotion;
-use crate::residual::LineNoise;
-use crate::wheel_faults::{WheelFault, WheelMonitor};
+use crate::tracking::correction::{Observability, Verdict};
 
 /// The odometry against the scanner.
 #[derive(Clone, Debug)]
@@ -117,7 +117,7 @@ impl OdometryHealth {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
+    use crate::geometry::pose::pose;
 
     /// Scans that fix the pose of a robot that goes 5 cm each, while its counters stand still.
     fn frozen(config: &SlamConfig, scans: usize) -> OdometryHealth {

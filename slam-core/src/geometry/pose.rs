@@ -4,7 +4,7 @@
 
 use nalgebra::{Complex, Isometry2, Matrix3, Translation2, UnitComplex, Vector2, Vector3};
 
-use crate::math::{atan2, sin_cos, wrap_angle};
+use crate::geometry::math::{atan2, sin_cos, wrap_angle};
 
 /// The pose `(x, y, θ)` as an isometry; metres, radians.
 #[inline]

@@ -9,18 +9,18 @@
 use heapless::Vec;
 use nalgebra::{Isometry2, Point2, Vector3};
 
-use crate::association::Pair;
 use crate::config::SlamConfig;
-use crate::extraction::MAX_SEGMENTS;
-use crate::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
-use crate::keyframe::KeyframeConfig;
+use crate::ekf::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
+use crate::ekf::keyframe::KeyframeConfig;
+use crate::frontend::extraction::MAX_SEGMENTS;
+use crate::geometry::math::{max, min};
+use crate::geometry::pose::{cross, difference, is_finite};
+use crate::geometry::residual::{LineNoise, Residual};
+use crate::geometry::segment::Segment;
+use crate::map::nearby::Nearby;
 use crate::map::{MapSegment, SegmentMap};
-use crate::math::{max, min};
-use crate::nearby::Nearby;
 use crate::paper::end_points::EndPointsConfig;
-use crate::pose::{cross, difference, is_finite};
-use crate::residual::{LineNoise, Residual};
-use crate::segment::Segment;
+use crate::tracking::association::Pair;
 
 /// Most sightings of a keyframe that are taken in.
 pub const MAX_TAKEN: usize = 12;
@@ -491,10 +491,10 @@ fn distance_m(long: &Segment, short: &Segment) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::pose::components;
+    use crate::geometry::pose::{perpendicular, pose};
+    use crate::geometry::segment::Moments;
     use crate::paper::end_points::{EndPointWeight, register_end_points};
-    use crate::pose::components;
-    use crate::pose::{perpendicular, pose};
-    use crate::segment::Moments;
     use nalgebra::{Matrix3, Vector3};
     use std::vec::Vec as StdVec;
 
