@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use robot_file::robot::Robot;
-use slam_core::pose::components;
+use slam_core::geometry::pose::components;
 
 /// Boards, by their features as cargo spells them, and their memory.
 const BOARDS: [(&str, &str); 1] = [("NUCLEO_F429ZI", "memory.x")];
@@ -69,7 +69,7 @@ fn constants(path: &Path) -> String {
         "/// Puts sensor, mounting and odometry into a configuration.\n\
          pub fn apply(config: &mut slam_core::SlamConfig) {{\n\
          use slam_core::odometry::*;\n\
-         use slam_core::scan::*;\n\
+         use slam_core::sensor::scan::*;\n\
          config.odometry.noise = {noise:?};\n\
          config.line_noise.sigma_offset_m = {:?};\n\
          config.sensor.geometry = {:?};\n\
@@ -77,7 +77,7 @@ fn constants(path: &Path) -> String {
          config.sensor.codes = {:?};\n\
          config.sensor.noise = {:?};\n\
          config.sensor.mounting = Mounting {{\n\
-             base_from_laser: slam_core::pose::pose({:?}, {:?}, {:?}),\n\
+             base_from_laser: slam_core::geometry::pose::pose({:?}, {:?}, {:?}),\n\
              upside_down: {:?},\n\
          }};\n}}\n",
         config.line_noise.sigma_offset_m,

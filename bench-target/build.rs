@@ -9,7 +9,7 @@ use lineslam::robot::Robot;
 use lineslam::sim::fixed_set::FixedSet;
 use nalgebra::{Isometry2, Vector2};
 use slam_core::MapSegment;
-use slam_core::pose::components;
+use slam_core::geometry::pose::components;
 
 /// Scans in the set, one after the other.
 const SCANS: usize = 300;

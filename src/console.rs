@@ -8,8 +8,8 @@ use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::signal::Signal;
 use heapless::String;
 use nalgebra::Isometry2;
-use slam_core::math::sin_cos;
-use slam_core::pose::heading;
+use slam_core::geometry::math::sin_cos;
+use slam_core::geometry::pose::heading;
 
 /// The newest pose. Latest wins.
 pub static CONSOLE: Signal<CriticalSectionRawMutex, PoseLine> = Signal::new();

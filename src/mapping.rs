@@ -10,9 +10,9 @@ use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Receiver;
 use embassy_time::{Duration, Instant, Ticker};
-use slam_core::pose::components;
+use slam_core::geometry::pose::components;
+use slam_core::odometry::wheel_faults::WheelFault;
 use slam_core::tracking::TrackingState;
-use slam_core::wheel_faults::WheelFault;
 
 use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;

@@ -4,7 +4,7 @@
 use core::ptr::addr_of_mut;
 
 use slam_core::WheelTicks;
-use slam_core::pose::components;
+use slam_core::geometry::pose::components;
 
 use crate::kept::{Mapper, SAMPLES};
 
@@ -107,5 +107,5 @@ impl Tracer {
 
 /// Standard deviation of a variance.
 pub fn sigma(variance: f32) -> f32 {
-    slam_core::math::sqrt(variance.max(0.0))
+    slam_core::geometry::math::sqrt(variance.max(0.0))
 }

@@ -7,10 +7,10 @@ use cortex_m::peripheral::DWT;
 use defmt_rtt as _;
 use nalgebra::{Point2, Vector2};
 use panic_probe as _;
+use slam_core::geometry::pose::pose;
+use slam_core::geometry::segment::Moments;
 use slam_core::odometry::Increment;
-use slam_core::odometry_track::SWEEP_KNOTS;
-use slam_core::pose::pose;
-use slam_core::segment::Moments;
+use slam_core::odometry::track::SWEEP_KNOTS;
 use slam_core::slam::Stage;
 use slam_core::{MapSegment, Scan, ScanMotion, Segment, Slam, SlamConfig};
 
@@ -176,13 +176,13 @@ fn functions() {
     );
     function(
         "sin_cos",
-        |k| both(slam_core::math::sin_cos(angle(k))),
+        |k| both(slam_core::geometry::math::sin_cos(angle(k))),
         |k| both(F32Ext::sin_cos(angle(k))),
         |k| libm::sin(wide(k)) + libm::cos(wide(k)),
     );
     function(
         "sqrt",
-        |k| slam_core::math::sqrt(k as f32),
+        |k| slam_core::geometry::math::sqrt(k as f32),
         |k| F32Ext::sqrt(k as f32),
         |k| libm::sqrt(f64::from(k)),
     );

@@ -4,7 +4,7 @@ use nalgebra::{Isometry2, Vector3};
 use rigless::emulator::Host;
 use rigless::soc::Width;
 use slam_core::WheelTicks;
-use slam_core::pose::pose;
+use slam_core::geometry::pose::pose;
 
 /// The layout that is understood.
 const LAYOUT: u64 = 1;

@@ -8,7 +8,7 @@ use lineslam::sim::{Drive, UnitErrors};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
 use slam_core::odometry::Integration;
-use slam_core::scan::Reading;
+use slam_core::sensor::scan::Reading;
 use slam_core::{MapSegment, Mapper, Segment, WheelTicks};
 
 use crate::record::{Entry, Event};
@@ -252,7 +252,7 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
             Event::Scan { middle_us, ranges_mm, .. } => drop(mapper.scan(*middle_us, ranges_mm)),
             Event::Coasted { until_us } => drop(mapper.coast(*until_us)),
         }
-        let here = slam_core::pose::components(&mapper.slam().pose());
+        let here = slam_core::geometry::pose::components(&mapper.slam().pose());
         let same = (0..3).all(|i| here[i].to_bits() == entry.pose[i].to_bits())
             && mapper.slam().map().segments().len() == entry.segments as usize;
         if !same {

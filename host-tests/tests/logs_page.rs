@@ -33,8 +33,12 @@ fn the_example_is_read() {
     assert_eq!(robot.wheels.unwrap().counter_bits, 16);
     let sensor = robot.sensor_for(&log.layout(1));
     let codes = sensor.codes;
-    assert_eq!(codes.read(log.scans[1].ranges_mm[1]), slam_core::scan::Reading::Bad, "null is not measured");
-    assert_eq!(codes.read(5600), slam_core::scan::Reading::NoEcho, "the greatest range met nothing");
+    assert_eq!(
+        codes.read(log.scans[1].ranges_mm[1]),
+        slam_core::sensor::scan::Reading::Bad,
+        "null is not measured"
+    );
+    assert_eq!(codes.read(5600), slam_core::sensor::scan::Reading::NoEcho, "the greatest range met nothing");
     assert!((sensor.geometry.step_rad().to_degrees() - 45.0).abs() < 1e-4);
     replay::run(&log, &robot, SlamConfig::default(), || {}).unwrap();
 }

@@ -4,8 +4,8 @@
 //! beams, those too that met nothing in range.
 
 use nalgebra::{Isometry2, Point2};
-use slam_core::deskew::{ScanPoint, deskew};
-use slam_core::scan::{RangeCodes, Reading};
+use slam_core::frontend::deskew::{ScanPoint, deskew};
+use slam_core::sensor::scan::{RangeCodes, Reading};
 use slam_core::{Scan, ScanMotion};
 
 use crate::log::Log;
@@ -77,7 +77,7 @@ pub fn seen(log: &Log, replay: &Replay, scan: usize) -> Seen {
         })
         .collect();
     let max_mm = codes.max_mm.min(u16::MAX - 1);
-    let all = slam_core::scan::SensorConfig {
+    let all = slam_core::sensor::scan::SensorConfig {
         codes: RangeCodes { max_mm, no_echo_mm: [(1, 0); 2], ..codes },
         ..sensor
     };

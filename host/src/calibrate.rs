@@ -15,8 +15,8 @@ use std::path::Path;
 
 use nalgebra::{Isometry2, SMatrix, SVector, Vector2, Vector3};
 use slam_core::SlamConfig;
-use slam_core::correction::Verdict;
-use slam_core::wheel_faults::WheelFault;
+use slam_core::odometry::wheel_faults::WheelFault;
+use slam_core::tracking::correction::Verdict;
 use toml_edit::{DocumentMut, value};
 
 use crate::log::{Log, Odometry};

@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use nalgebra::Isometry2;
 use slam_core::config::ConfigError;
+use slam_core::geometry::pose::pose;
 use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::{Increment, OdometryNoise};
-use slam_core::pose::pose;
-use slam_core::scan::{ScanGeometry, SensorConfig};
+use slam_core::sensor::scan::{ScanGeometry, SensorConfig};
 use slam_core::slam::Counters;
 use slam_core::{OdometryTrack, Scan, ScanMotion, Slam, SlamConfig, SlamUpdate};
 

@@ -12,7 +12,7 @@ use lineslam::output::{csv, dxf as drawing};
 use lineslam::replay;
 use lineslam::robot::Robot;
 use nalgebra::{Isometry2, Point2, Vector2};
-use slam_core::segment::Moments;
+use slam_core::geometry::segment::Moments;
 use slam_core::{MapSegment, SlamConfig};
 
 fn simulate(out: &Path, more: &[&str]) -> Output {

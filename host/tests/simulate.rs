@@ -325,8 +325,9 @@ fn a_written_log_is_read_as_it_was() {
     assert_eq!(stated.drive(), known.drive());
     let [stated, known] = [&stated, &known].map(|robot| robot.sensor_for(&read.layout(0)));
     for beam in [0, 100, 681] {
-        let bearing = |sensor: &slam_core::scan::SensorConfig| {
-            slam_core::pose::heading(&sensor.mounting.base_from_laser) + sensor.geometry.bearing(beam)
+        let bearing = |sensor: &slam_core::sensor::scan::SensorConfig| {
+            slam_core::geometry::pose::heading(&sensor.mounting.base_from_laser)
+                + sensor.geometry.bearing(beam)
         };
         assert!(
             (bearing(&stated) - bearing(&known)).abs() < 1e-5,

@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use slam_core::SlamConfig;
+use slam_core::geometry::pose::pose;
 use slam_core::odometry::{DifferentialDrive, ticks_between_u16, ticks_between_u32};
-use slam_core::pose::pose;
-use slam_core::scan::{Mounting, RangeNoise, ScanGeometry, SensorConfig};
+use slam_core::sensor::scan::{Mounting, RangeNoise, ScanGeometry, SensorConfig};
 
 use crate::odometry::{NoiseFile, NoiseText};
 use crate::sensor::{Sensor, SensorText};

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
-use slam_core::scan::{RangeCodes, ScanGeometry};
+use slam_core::sensor::scan::{RangeCodes, ScanGeometry};
 
 use crate::profile::{self, needed};
 use crate::toml_file::{FileError, Impossible, not_negative, positive};

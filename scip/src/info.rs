@@ -167,7 +167,7 @@ fn slot<'a, T>(keys: &[&str], slots: &'a mut [T], key: &str) -> Option<&'a mut T
 }
 
 #[cfg(feature = "slam-core")]
-impl From<&SensorInfo> for slam_core::scan::ScanGeometry {
+impl From<&SensorInfo> for slam_core::sensor::scan::ScanGeometry {
     fn from(info: &SensorInfo) -> Self {
         Self {
             first_step: info.first_step,
@@ -180,7 +180,7 @@ impl From<&SensorInfo> for slam_core::scan::ScanGeometry {
 }
 
 #[cfg(feature = "slam-core")]
-impl From<&SensorInfo> for slam_core::scan::RangeCodes {
+impl From<&SensorInfo> for slam_core::sensor::scan::RangeCodes {
     /// Codes 0 and 6 mean "nothing in range" on this family of sensors.
     fn from(info: &SensorInfo) -> Self {
         Self { min_mm: info.min_range_mm, max_mm: info.max_range_mm, ..Self::URG_04LX }
@@ -220,8 +220,14 @@ mod tests {
         assert_eq!(info.revolution_us(), 100_000);
         // 44 at 4.3 ms, 384 at 37.5 ms, 725 at 70.8 ms.
         assert_eq!([44, 384, 725].map(|s| info.step_us(s)), [4_296, 37_500, 70_800]);
-        assert_eq!(slam_core::scan::ScanGeometry::from(&info), slam_core::scan::ScanGeometry::URG_04LX);
-        assert_eq!(slam_core::scan::RangeCodes::from(&info), slam_core::scan::RangeCodes::URG_04LX);
+        assert_eq!(
+            slam_core::sensor::scan::ScanGeometry::from(&info),
+            slam_core::sensor::scan::ScanGeometry::URG_04LX
+        );
+        assert_eq!(
+            slam_core::sensor::scan::RangeCodes::from(&info),
+            slam_core::sensor::scan::RangeCodes::URG_04LX
+        );
     }
 
     #[test]

@@ -1,27 +1,27 @@
 //! All settings, one struct for each stage, and where each value comes from.
 
-use nalgebra::Isometry2;
+use nalgebra::{Isometry2, Vector3};
 
-use crate::association::{AssociationConfig, GateConfig};
-use crate::correction::{CorrectionConfig, GaussNewtonConfig};
-use crate::deskew::DeskewConfig;
-use crate::extraction::{ExtractionConfig, SplitConfig};
-use crate::keyframe::KeyframeConfig;
+use crate::ekf::keyframe::KeyframeConfig;
+use crate::ekf::registration::{JointConfig, MAX_TAKEN, RegistrationConfig};
+use crate::frontend::deskew::DeskewConfig;
+use crate::frontend::extraction::{ExtractionConfig, SplitConfig};
+use crate::geometry::math::min;
+use crate::geometry::residual::LineNoise;
 use crate::loop_closure::LoopConfig;
-use crate::math::min;
-use crate::noise_learning::LearningConfig;
+use crate::map::visibility::ForgetConfig;
+use crate::odometry::bias::BiasConfig;
+use crate::odometry::monitor::MonitorConfig;
+use crate::odometry::noise_learning::LearningConfig;
 use crate::odometry::{Integration, OdometryNoise};
-use crate::odometry_bias::BiasConfig;
-use crate::odometry_monitor::MonitorConfig;
 use crate::paper::bisector::BisectorConfig;
 use crate::paper::end_points::{EndPointWeight, EndPointsConfig};
 use crate::paper::least_squares::{LeastSquaresConfig, Singular};
 use crate::paper::ransac::RansacConfig;
-use crate::registration::{JointConfig, MAX_TAKEN, RegistrationConfig};
-use crate::residual::LineNoise;
-use crate::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
+use crate::sensor::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
+use crate::tracking::association::{AssociationConfig, GateConfig};
+use crate::tracking::correction::{CorrectionConfig, GaussNewtonConfig};
 use crate::tracking::{SearchConfig, StateConfig};
-use crate::visibility::ForgetConfig;
 
 /// Odometry settings.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,6 +38,13 @@ pub struct OdometryConfig {
     pub track_m: Option<f32>,
     /// Check against the scanner, or none.
     pub monitor: Option<MonitorConfig>,
+}
+
+impl OdometryConfig {
+    /// Standard deviations of the systematic errors before anything is learnt; zero where they are not to be.
+    pub(crate) fn bias_sigmas(&self) -> Vector3<f32> {
+        self.bias.map_or_else(Vector3::zeros, |bias| bias.sigmas())
+    }
 }
 
 /// Everything [`Slam`](crate::Slam) can be told.
@@ -328,7 +335,10 @@ impl SlamConfig {
         positive("sensor.noise.sigma_m", s.noise.sigma_m)?;
         not_negative("sensor.noise.sigma_per_m", s.noise.sigma_per_m)?;
         positive("sensor.noise.sigma_bearing_rad", s.noise.sigma_bearing_rad)?;
-        check("sensor.mounting.base_from_laser", crate::pose::is_finite(&s.mounting.base_from_laser))
+        check(
+            "sensor.mounting.base_from_laser",
+            crate::geometry::pose::is_finite(&s.mounting.base_from_laser),
+        )
     }
 
     fn validate_odometry(&self) -> Result<(), ConfigError> {

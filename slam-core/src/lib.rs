@@ -8,19 +8,22 @@
 //! [`SlamConfig::paper_partial`].
 //!
 //! ```text
-//!  ranges_mm ──► deskew ──► extraction ──► association ◄──┐ ──► registration ──► map
-//!                  ▲        [Segment]       [Pair] │      │       [Joint]         │
-//!  ticks ──► odometry ──► predicted pose ────────► [Tracker] ───────► │ ▲    forgetting
-//!            [OdometryTrack]  ▲              correction, heading search│ │          │
-//!                             └───── pose, odometry's errors ◄───────┘ loop closure
+//!  ranges_mm ──► frontend ──────────► tracking ◄─► loop closure ──► registration ──► map
+//!                deskew, extraction   association,                  ekf: Joint        │
+//!                  ▲     [Segment]    correction, [Pair]             ▲ │          forgetting
+//!                  │                  heading search                 │ │              │
+//!  ticks ──► odometry ──► predict ───────┴──► pose ──────────────────┘ │              │
+//!            [OdometryTrack]  ▲                                        ▼              ▼
+//!                  ▲          └───────── pose, its covariance, the odometry's errors, lines
+//!                  └── monitor, noise and wheel faults, by what the scan says
 //! ```
 //!
-//! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are
-//! [`keyframe`]s the joint estimate then has the last word on the pose, on the odometry's errors and on the lines, a few
-//! scans later.
+//! [`Slam::process_scan`](slam::Slam::process_scan) reads like that drawing: predict, observe, track, close the loop, monitor the
+//! odometry, judge the state, register, forget. Each stage is a folder of its own and can be used without it.
 //!
-//! [`Slam::process_scan`](slam::Slam::process_scan) is that drawing; each stage is a module of its own and can be used
-//! without it.
+//! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are
+//! [`keyframe`](ekf::keyframe)s the joint estimate then has the last word on the pose, on the odometry's errors and on the lines,
+//! a few scans later.
 //!
 //! # Frames and units
 //! Frames follow REP 105: `map`, `odom`, `base` (middle of the axle, x forward, y left, counter-clockwise positive) and
@@ -29,8 +32,9 @@
 //! Times are those of the middle beam of a scan.
 //!
 //! # Reading order
-//! [`mapper`] for what a firmware holds, [`slam`] for the whole, [`segment`] for what a line is, then the stages in the
-//! order of the drawing. [`config`] has every constant and where it comes from.
+//! [`mapper`] for what a firmware holds, [`slam`] for the whole, [`geometry::segment`] for what a line is, [`sensor`] and [`odometry`]
+//! for what comes in, then the stages in the order of the drawing: [`frontend`], [`tracking`], [`ekf`] and [`map`], and [`paper`] for
+//! the paper's own. [`config`] has every constant and where it comes from.
 //!
 //! # Example
 //! ```
@@ -73,40 +77,25 @@
 #[cfg(test)]
 extern crate std;
 
-pub mod association;
 pub mod config;
-pub mod correction;
-pub mod deskew;
-pub mod extraction;
-pub mod joint;
-pub mod keyframe;
+pub mod ekf;
+mod estimator;
+pub mod frontend;
+pub mod geometry;
 pub mod loop_closure;
 pub mod map;
 pub mod mapper;
-pub mod math;
-pub mod nearby;
-pub mod noise_learning;
 pub mod odometry;
-pub mod odometry_bias;
-pub mod odometry_monitor;
-pub mod odometry_track;
 pub mod paper;
-pub mod pose;
-pub mod registration;
-pub mod residual;
-pub mod scan;
-pub mod segment;
+pub mod sensor;
 pub mod slam;
-mod told;
 pub mod tracking;
 pub mod update;
-pub mod visibility;
-pub mod wheel_faults;
 
 pub use config::{ConfigError, SlamConfig};
+pub use geometry::segment::Segment;
 pub use map::{MapSegment, SegmentMap};
 pub use mapper::{Mapper, WheelTicks};
-pub use odometry_track::{OdometryTrack, ScanMotion};
-pub use scan::Scan;
-pub use segment::Segment;
+pub use odometry::track::{OdometryTrack, ScanMotion};
+pub use sensor::scan::Scan;
 pub use slam::{Slam, SlamUpdate};

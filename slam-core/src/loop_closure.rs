@@ -10,9 +10,14 @@
 
 use nalgebra::{Isometry2, Matrix3, Vector2};
 
+use crate::estimator::{Estimator, Surroundings};
+use crate::geometry::math::{max, min, sin_cos, wrap_angle};
+use crate::geometry::pose::{components, difference, pose};
 use crate::map::MapSegment;
-use crate::math::{min, sin_cos, wrap_angle};
-use crate::pose::{components, pose};
+use crate::tracking::Hypothesis;
+use crate::tracking::correction::{Observability, Prior, Verdict};
+use crate::tracking::tracker::{Kernel, Scene};
+use crate::update::Stage;
 
 /// Settings of loop closure.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,7 +45,7 @@ pub struct LoopConfig {
 }
 
 /// Covariance of what the pose has drifted since segments seen `way_m` ago.
-pub(crate) fn drift(config: &LoopConfig, way_m: f32) -> Matrix3<f32> {
+fn drift(config: &LoopConfig, way_m: f32) -> Matrix3<f32> {
     let var_position = config.sigma_position_m_per_sqrt_m * config.sigma_position_m_per_sqrt_m * way_m;
     let var_heading = config.sigma_heading_rad_per_sqrt_m * config.sigma_heading_rad_per_sqrt_m * way_m;
     Matrix3::from_diagonal(&nalgebra::Vector3::new(var_position, var_position, var_heading))
@@ -59,15 +64,54 @@ pub struct Closure {
     pub way_m: f32,
 }
 
-/// The correction that the last scans asked for, and how many of them.
+/// Recognises old parts of the map, and closes loops.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct PendingClosure {
+pub(crate) struct LoopCloser {
+    /// The correction that the last scans asked for, and how many of them.
     asked: Option<(Isometry2<f32>, u8)>,
 }
 
-impl PendingClosure {
+impl LoopCloser {
+    /// Looks for the scan at hand among what was not seen for long. Where the loop is closed the map is bent and the pose moved with it;
+    /// returns the closure and the directions of the pose that the old lines fix.
+    ///
+    /// Work: one step for each line around the robot; where some are old, that of one hypothesis.
+    pub fn close<const N: usize>(
+        &mut self,
+        config: &LoopConfig,
+        estimator: &mut Estimator,
+        around: &mut Surroundings<'_, N>,
+        watch: &mut impl FnMut(Stage),
+    ) -> Option<(Closure, Observability)> {
+        watch(Stage::Association);
+        let way_m = estimator.travelled_m();
+        let unseen_m =
+            |i: &u16| around.map.segments().get(usize::from(*i)).map_or(0.0, |s| way_m - s.seen_at_m);
+        let oldest_m = around.tracker.nearby.all().iter().map(unseen_m).fold(0.0, max);
+        if oldest_m < config.min_way_m {
+            return None;
+        }
+        estimator.commit(around);
+        let local = estimator.local();
+        let (hypothesis, loop_began_m) = among_old_lines(config, &local, way_m, oldest_m, around, watch);
+        let closure = Closure { drifted: local.pose, closed: hypothesis.pose, loop_began_m, way_m };
+        let mut closed = None;
+        if !is_likely(config, &hypothesis, &local, estimator) {
+            *self = Self::default();
+        } else if self.confirmed_by(&closure, config) {
+            around.map.iter_mut().for_each(|entry| closure.bend_segment(entry));
+            estimator.accept(&hypothesis);
+            closed = Some((closure, hypothesis.observability));
+        }
+        watch(Stage::Association);
+        let scene = Scene { observed: around.observed, map: around.map.segments(), config: around.config };
+        let local = estimator.local();
+        around.tracker.associate(&scene, &Hypothesis::at(local.pose, local.covariance));
+        closed
+    }
+
     /// Whether enough scans in a row have asked for the same correction, this one included. Starts anew when they have.
-    pub fn confirmed_by(&mut self, closure: &Closure, config: &LoopConfig) -> bool {
+    fn confirmed_by(&mut self, closure: &Closure, config: &LoopConfig) -> bool {
         let times = match self.asked {
             Some((correction, times)) => {
                 let off = components(&(correction * closure.drifted).inv_mul(&closure.closed));
@@ -82,6 +126,43 @@ impl PendingClosure {
         self.asked = if confirmed { None } else { Some((correction, times)) };
         confirmed
     }
+}
+
+/// The pose by the lines that were not seen for long, and the way driven when the last of those paired was seen.
+fn among_old_lines<const N: usize>(
+    config: &LoopConfig,
+    local: &Prior,
+    way_m: f32,
+    oldest_m: f32,
+    around: &mut Surroundings<'_, N>,
+    watch: &mut impl FnMut(Stage),
+) -> (Hypothesis, f32) {
+    let scene = Scene { observed: around.observed, map: around.map.segments(), config: around.config };
+    let is_old = |entry: &MapSegment| way_m - entry.seen_at_m >= config.min_way_m;
+    around.tracker.gather(scene.map, &local.pose, scene.config, is_old);
+    let prior = Prior { covariance: local.covariance + drift(config, oldest_m), ..*local };
+    let start = Hypothesis::of_prior(&prior);
+    let hypothesis = around.tracker.refined(&scene, &prior, start, Kernel::Strict, watch);
+    around.tracker.gather_all(&scene, &local.pose);
+    let seen_at_m = around.tracker.pairs.iter().filter_map(|p| scene.map.get(p.mapped)).map(|s| s.seen_at_m);
+    (hypothesis, seen_at_m.fold(0.0, max))
+}
+
+/// Whether the old lines fix a pose that the robot has drifted from, and may have.
+fn is_likely(config: &LoopConfig, hypothesis: &Hypothesis, local: &Prior, estimator: &Estimator) -> bool {
+    let is_seen = hypothesis.observability.verdict == Verdict::Full && hypothesis.score >= config.min_support;
+    let drifted = chi2_between(&hypothesis.pose, &local.pose, &local.covariance) >= config.min_chi2;
+    // The filter knows how far the pose may have drifted.
+    let may_have = estimator
+        .filter_covariance()
+        .is_none_or(|covariance| chi2_between(&hypothesis.pose, &local.pose, &covariance) <= config.max_chi2);
+    is_seen && drifted && may_have
+}
+
+/// Squared Mahalanobis distance between two poses.
+fn chi2_between(a: &Isometry2<f32>, b: &Isometry2<f32>, covariance: &Matrix3<f32>) -> f32 {
+    let off = difference(a, b);
+    covariance.try_inverse().map_or(0.0, |w| off.dot(&(w * off)))
 }
 
 impl Closure {
@@ -104,7 +185,7 @@ impl Closure {
     }
 
     /// Moves a segment of the map.
-    pub(crate) fn bend_segment(&self, entry: &mut MapSegment) {
+    fn bend_segment(&self, entry: &mut MapSegment) {
         let bent = entry.segment.transformed(&self.bend(entry.seen_at_m));
         if bent.is_finite() {
             entry.segment = bent;
@@ -115,7 +196,7 @@ impl Closure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::segment::Segment;
+    use crate::geometry::segment::Segment;
     use nalgebra::Point2;
 
     fn entry(x: f32, seen_at_m: f32) -> MapSegment {

@@ -9,9 +9,9 @@ use core::mem::MaybeUninit;
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::{ConfigError, SlamConfig};
+use crate::odometry::track::OdometryTrack;
 use crate::odometry::{DifferentialDrive, Increment};
-use crate::odometry_track::OdometryTrack;
-use crate::scan::Scan;
+use crate::sensor::scan::Scan;
 use crate::slam::{Slam, SlamUpdate};
 
 /// Wheel ticks at an instant.
@@ -209,7 +209,7 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::components;
+    use crate::geometry::pose::components;
 
     const DRIVE: DifferentialDrive = DifferentialDrive {
         left_wheel_radius_m: 0.05,

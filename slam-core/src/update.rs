@@ -2,14 +2,16 @@
 
 use nalgebra::{Isometry2, Matrix3};
 
-use crate::correction::Observability;
-use crate::deskew::DeskewReport;
-use crate::extraction::ExtractionReport;
+use crate::ekf::registration::RegistrationReport;
+use crate::frontend::deskew::DeskewReport;
+use crate::frontend::extraction::ExtractionReport;
 use crate::loop_closure::Closure;
 use crate::map::MapCounters;
-use crate::registration::RegistrationReport;
+use crate::odometry::wheel_faults::WheelFault;
+use crate::sensor::scan::{Scan, ScanGeometry};
 use crate::tracking::TrackingState;
-use crate::wheel_faults::WheelFault;
+use crate::tracking::correction::{Observability, Prior};
+use crate::tracking::tracker::Tracked;
 
 /// What happened since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -40,6 +42,26 @@ pub struct Counters {
     pub lost: u32,
 }
 
+impl Counters {
+    /// Counts a motion, if it could not be used.
+    pub(crate) fn count_motion(&mut self, is_usable: bool) {
+        self.bad_motion = self.bad_motion.saturating_add(u32::from(!is_usable));
+    }
+
+    /// Counts a scan.
+    pub(crate) fn count(&mut self, update: &SlamUpdate) {
+        let add = |counter: &mut u32, amount: u32| *counter = counter.saturating_add(amount);
+        add(&mut self.scans, 1);
+        add(&mut self.wrong_beam_count, u32::from(update.rejected.is_some()));
+        add(&mut self.without_segments, u32::from(update.extraction.segments == 0));
+        add(&mut self.uncorrected, u32::from(!update.corrected));
+        add(&mut self.loops_closed, u32::from(update.closure.is_some()));
+        add(&mut self.crowded_out, update.extraction.crowded_out);
+        add(&mut self.odometry_left_out, u32::from(update.odometry_left_out));
+        add(&mut self.lost, u32::from(update.state == TrackingState::Lost));
+    }
+}
+
 /// Why a scan was not used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -52,6 +74,14 @@ pub enum ScanRejection {
         /// Ranges given.
         actual: usize,
     },
+}
+
+impl ScanRejection {
+    /// Why a scan of this geometry is not to be used, if it is not.
+    pub(crate) fn of(scan: &Scan<'_>, geometry: &ScanGeometry) -> Option<Self> {
+        let (expected, actual) = (geometry.beams(), scan.ranges_mm.len());
+        (expected != actual).then_some(Self::WrongBeamCount { expected, actual })
+    }
 }
 
 /// What the core is at.
@@ -133,4 +163,42 @@ pub struct SlamUpdate {
     pub counters: Counters,
     /// Counters of the map, this scan included.
     pub map_counters: MapCounters,
+}
+
+impl SlamUpdate {
+    /// A scan of which nothing is known but the prediction.
+    pub(crate) fn predicted(prior: &Prior, state: TrackingState) -> Self {
+        Self {
+            pose: prior.pose,
+            covariance: prior.covariance,
+            predicted: prior.pose,
+            deskew: DeskewReport::default(),
+            extraction: ExtractionReport::default(),
+            registration: RegistrationReport::default(),
+            corrected: false,
+            iterations: 0,
+            support: 0.0,
+            residual_m: 0.0,
+            contradicted_share: 0.0,
+            state,
+            odometry_left_out: false,
+            odometry_useless: false,
+            wheel_fault: None,
+            observability: Observability::BLIND,
+            way_m: 0.0,
+            closure: None,
+            rejected: None,
+            counters: Counters::default(),
+            map_counters: MapCounters::default(),
+        }
+    }
+
+    /// Takes what tracking found; the pose goes to the estimator.
+    pub(crate) fn take(&mut self, tracked: &Tracked) {
+        self.corrected = tracked.hypothesis.corrected;
+        self.iterations = tracked.iterations;
+        self.support = tracked.hypothesis.score;
+        self.observability = tracked.hypothesis.observability;
+        self.odometry_left_out = tracked.left_out.is_some();
+    }
 }

@@ -4,11 +4,11 @@
 
 use nalgebra::{Isometry2, Point2, Vector2};
 use proptest::prelude::*;
-use slam_core::correction::Verdict;
+use slam_core::geometry::pose::{components, pose};
 use slam_core::odometry::Increment;
-use slam_core::odometry_track::{SWEEP_KNOTS, ScanMotion};
-use slam_core::pose::{components, pose};
+use slam_core::odometry::track::{SWEEP_KNOTS, ScanMotion};
 use slam_core::slam::ScanRejection;
+use slam_core::tracking::correction::Verdict;
 use slam_core::{Scan, Slam, SlamConfig};
 
 const BEAMS: usize = 682;

@@ -1,6 +1,6 @@
 //! A log with a little more noise on its ranges: what a figure owes to chance shows in how far it moves.
 
-use slam_core::scan::{RangeCodes, Reading};
+use slam_core::sensor::scan::{RangeCodes, Reading};
 
 use crate::log::Log;
 use crate::robot::Robot;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use comfy_table::{Table, presets};
 use lineslam::output::scan::{self, Beams};
 use lineslam::serial::{self, OneScan};
-use slam_core::scan::{RangeCodes, ScanGeometry};
+use slam_core::sensor::scan::{RangeCodes, ScanGeometry};
 
 use super::common::write_one;
 

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use rayon::prelude::*;
 use slam_core::SlamConfig;
-use slam_core::correction::Verdict;
+use slam_core::tracking::correction::Verdict;
 
 use crate::replay::{self, Replay, ReplayError};
 use crate::robot::Robot;

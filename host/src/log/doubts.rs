@@ -7,8 +7,8 @@
 //! frozen: fewer than a third of the turns agree, or none) and on recorded logs, whose odometry is good: exp1, exp3, fr079, fr101,
 //! fhw, test_lab2 (more than three quarters agree). Logs of key scans alone have too few pairs to be judged.
 
-use slam_core::scan::{Reading, SensorConfig};
-use slam_core::wheel_faults::WheelFault;
+use slam_core::odometry::wheel_faults::WheelFault;
+use slam_core::sensor::scan::{Reading, SensorConfig};
 
 use super::{Log, Warning};
 use crate::output::tracking::Tracking;
@@ -137,7 +137,8 @@ fn at_s(steps: &[Step], stamp_us: u64) -> f64 {
 
 /// What wheels and scanner say against each other, if they do.
 fn odometry_against_scanner(log: &Log, robot: &Robot, steps: &[Step]) -> Option<Warning> {
-    let turn_of = |k: usize| slam_core::pose::heading(&steps[k].motion.since_previous.before_from_after);
+    let turn_of =
+        |k: usize| slam_core::geometry::pose::heading(&steps[k].motion.since_previous.before_from_after);
     let pairs = |fits: &dyn Fn(f32) -> bool| -> Vec<(f32, f32)> {
         let near = |k: &usize| steps[*k].motion.since_previous.distance_m < MOST_WAY_M;
         let chosen: Vec<usize> = (1..steps.len()).filter(|k| fits(turn_of(*k).abs()) && near(k)).collect();

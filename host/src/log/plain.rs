@@ -165,7 +165,7 @@ impl Parser {
 pub fn render(log: &Log, robot: &Robot) -> String {
     let sensor = robot.sensor_for(&log.layout(0));
     let (codes, mounting) = (sensor.codes, sensor.mounting);
-    let c = slam_core::pose::components(&mounting.base_from_laser);
+    let c = slam_core::geometry::pose::components(&mounting.base_from_laser);
     let header = Header {
         lineslam_log: VERSION,
         robot: Some(robot.name.clone()),

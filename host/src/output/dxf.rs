@@ -105,7 +105,7 @@ fn thinned<'a>(path: impl Iterator<Item = &'a Isometry2<f32>>) -> Vec<Point2<f32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slam_core::pose::pose;
+    use slam_core::geometry::pose::pose;
 
     #[test]
     fn the_path_reads_back_in_metres() {

@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use serde::Serialize;
 use slam_core::SlamConfig;
-use slam_core::correction::Verdict;
 use slam_core::map::MapCounters;
 use slam_core::slam::Counters;
+use slam_core::tracking::correction::Verdict;
 
 use super::tracking::Tracking;
 use crate::log::{Log, Warning, doubts};

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use nalgebra::{Isometry2, Point2};
-use slam_core::scan::{RangeCodes, Reading, ScanGeometry};
+use slam_core::sensor::scan::{RangeCodes, Reading, ScanGeometry};
 use svg::node::element::{Circle, Path};
 
 use super::svg::{PAPER, PATH, START, View, WALL, heading, legend};

@@ -1,8 +1,8 @@
 //! `trajectory.csv`: a scan a line, with how sure its pose is and what became of it.
 
 use slam_core::SlamUpdate;
-use slam_core::correction::Verdict;
-use slam_core::pose::components;
+use slam_core::geometry::pose::components;
+use slam_core::tracking::correction::Verdict;
 
 use crate::replay::Step;
 

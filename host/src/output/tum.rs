@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use nalgebra::Isometry2;
-use slam_core::pose::components;
+use slam_core::geometry::pose::components;
 
 /// Stamps in seconds with their six decimals, poses in metres.
 pub fn render<'a>(poses: impl Iterator<Item = (u64, &'a Isometry2<f32>)>) -> String {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use nalgebra::Isometry2;
-use slam_core::pose::pose;
+use slam_core::geometry::pose::pose;
 use slam_core::{MapSegment, ScanMotion, SlamConfig};
 
 use crate::replay;

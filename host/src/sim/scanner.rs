@@ -3,7 +3,7 @@
 use nalgebra::{Isometry2, Point2, Vector2};
 use rand::RngExt;
 use rand_pcg::Pcg64;
-use slam_core::scan::ScanGeometry;
+use slam_core::sensor::scan::ScanGeometry;
 
 pub use super::rays::{Hit, cast, distance_to};
 

@@ -4,8 +4,8 @@
 //! segment. The distance between the crossings with both is the distance between the segments; the nearest map segment within
 //! a threshold is the pair, and without one the segment is new. There is no gate on direction. The threshold is ours.
 
-use crate::pose::cross;
-use crate::segment::Segment;
+use crate::geometry::pose::cross;
+use crate::geometry::segment::Segment;
 
 /// Settings of the paper's association.
 #[derive(Clone, Copy, Debug, PartialEq)]

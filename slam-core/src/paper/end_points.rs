@@ -14,9 +14,9 @@
 
 use nalgebra::Isometry2;
 
+use crate::ekf::registration::{Observed, RegistrationReport, mark_seen};
+use crate::geometry::segment::{Moments, Segment};
 use crate::map::SegmentMap;
-use crate::registration::{Observed, RegistrationReport, mark_seen};
-use crate::segment::{Moments, Segment};
 
 /// Settings of the paper's registration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

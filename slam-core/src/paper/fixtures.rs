@@ -3,9 +3,9 @@
 use nalgebra::Point2;
 use std::vec::Vec;
 
-use crate::association::Pair;
+use crate::geometry::segment::{Moments, Segment};
 use crate::map::MapSegment;
-use crate::segment::{Moments, Segment};
+use crate::tracking::association::Pair;
 
 /// A wall of so many points, seen from the origin.
 pub fn wall(from: (f32, f32), to: (f32, f32), points: usize) -> Segment {

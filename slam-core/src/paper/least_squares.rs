@@ -23,12 +23,12 @@
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
-use crate::association::Pair;
-use crate::correction::{Correction, Prior, Verdict, finite, judge, largest};
+use crate::geometry::math::max;
+use crate::geometry::pose::{components, perpendicular, pose};
+use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
-use crate::math::max;
-use crate::pose::{components, perpendicular, pose};
-use crate::segment::Segment;
+use crate::tracking::association::Pair;
+use crate::tracking::correction::{Correction, Prior, Verdict, finite, judge, largest};
 
 /// Settings of the paper's correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -208,7 +208,7 @@ mod tests {
             let p = components(&predicted);
             let want = reference_step(&observed, &map, [f64::from(p.x), f64::from(p.y), f64::from(p.z)]);
             let moved = components(&got.pose) - p;
-            for (g, w) in [moved.x, moved.y, crate::math::wrap_angle(moved.z)].into_iter().zip(want) {
+            for (g, w) in [moved.x, moved.y, crate::geometry::math::wrap_angle(moved.z)].into_iter().zip(want) {
                 prop_assert!((f64::from(g) - w).abs() < 2e-4, "{} {}", g, w);
             }
         }

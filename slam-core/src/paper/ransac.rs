@@ -11,11 +11,11 @@ use nalgebra::Point2;
 use rand_core::{Rng, SeedableRng};
 use rand_pcg::Pcg32;
 
-use crate::deskew::ScanPoint;
-use crate::extraction::{Collector, MAX_SEGMENTS, Viewpoint};
-use crate::math::sqrt;
-use crate::pose::perpendicular;
-use crate::segment::{Line, Moments, Segment};
+use crate::frontend::deskew::ScanPoint;
+use crate::frontend::extraction::{Collector, MAX_SEGMENTS, Viewpoint};
+use crate::geometry::math::sqrt;
+use crate::geometry::pose::perpendicular;
+use crate::geometry::segment::{Line, Moments, Segment};
 
 /// Most beams of a scan that RANSAC can tell apart; points of later beams are left out.
 const MAX_BEAMS: usize = 2048;
@@ -180,7 +180,7 @@ fn finish(run: &[Point2<f32>], view: &Viewpoint<'_>, config: &RansacConfig, out:
 mod tests {
     use super::*;
     use crate::SlamConfig;
-    use crate::extraction::extract;
+    use crate::frontend::extraction::extract;
     use std::vec::Vec as StdVec;
 
     /// What is seen of two walls that meet, every point a little off.

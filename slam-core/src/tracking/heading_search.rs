@@ -11,11 +11,11 @@
 use heapless::Vec;
 use nalgebra::{Isometry2, Vector2};
 
+use crate::geometry::math::{atan2, max, min, sqrt, wrap_angle};
+use crate::geometry::pose::{cross, perpendicular};
+use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
-use crate::math::{atan2, max, min, sqrt, wrap_angle};
-use crate::nearby::Nearby;
-use crate::pose::{cross, perpendicular};
-use crate::segment::Segment;
+use crate::map::nearby::Nearby;
 
 /// Turns that are looked into.
 pub const MAX_PEAKS: usize = 4;
@@ -186,7 +186,7 @@ fn vote(seen: &Segment, mapped: &Segment, votes: &mut [[f32; CELLS]; CELLS]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::{components, pose};
+    use crate::geometry::pose::{components, pose};
     use nalgebra::Point2;
     use proptest::prelude::*;
 
@@ -194,7 +194,7 @@ mod tests {
         let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
         let left = nalgebra::center(&from, &to) + perpendicular(to - from);
         let points = (0..30).map(|i| (from + (to - from) * (i as f32 / 29.0), 1e4));
-        Segment::fitted(crate::segment::Moments::from_points(points), &[from, to], left)
+        Segment::fitted(crate::geometry::segment::Moments::from_points(points), &[from, to], left)
     }
 
     /// A room that looks alike from no two sides, with a recess.

@@ -2,12 +2,12 @@
 
 use nalgebra::{Isometry2, Matrix2, Matrix3};
 
-use crate::association::Pair;
-use crate::correction::{Observability, Prior};
+use crate::geometry::math::{max, within};
+use crate::geometry::residual::{LineNoise, Residual};
+use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
-use crate::math::{max, within};
-use crate::residual::{LineNoise, Residual};
-use crate::segment::Segment;
+use crate::tracking::association::Pair;
+use crate::tracking::correction::{Observability, Prior};
 
 /// A pair whose χ² is this large says nothing for a hypothesis: the 99.9 % point for two degrees of freedom.
 const MAX_CHI2: f32 = 13.8;

@@ -9,6 +9,9 @@
 //! [`Tracker`] owns the candidates among the map's lines and makes [`Hypothesis`] after hypothesis; [`heading_search`] proposes
 //! poses from the scan itself, without asking the wheels; [`state`] says whether the outcome is to be relied on.
 
+pub mod association;
+pub mod correction;
+mod evidence;
 pub mod heading_search;
 pub mod hypothesis;
 pub mod state;

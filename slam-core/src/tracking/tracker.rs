@@ -5,19 +5,19 @@ use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 use super::heading_search::{self, MAX_PEAKS};
 use super::hypothesis::{Hypothesis, tight_score};
-use crate::association::{AssociationConfig, Pair, Shortlist, View, associate};
 use crate::config::{ConfigError, SlamConfig, not_negative};
-use crate::correction::{
+use crate::frontend::extraction::MAX_SEGMENTS;
+use crate::geometry::math::{min, sin_cos};
+use crate::geometry::pose::{components, difference, perpendicular, pose};
+use crate::geometry::segment::Segment;
+use crate::map::MapSegment;
+use crate::map::nearby::Nearby;
+use crate::paper::least_squares::least_squares;
+use crate::slam::Stage;
+use crate::tracking::association::{AssociationConfig, Pair, Shortlist, View, associate};
+use crate::tracking::correction::{
     Correction, CorrectionConfig, GaussNewtonConfig, Prior, Standpoint, Verdict, maximum_a_posteriori,
 };
-use crate::extraction::MAX_SEGMENTS;
-use crate::map::MapSegment;
-use crate::math::{min, sin_cos};
-use crate::nearby::Nearby;
-use crate::paper::least_squares::least_squares;
-use crate::pose::{components, difference, perpendicular, pose};
-use crate::segment::Segment;
-use crate::slam::Stage;
 
 /// Settings of the search for a pose that explains more of a scan than the prediction does.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -215,6 +215,27 @@ impl<const N: usize> Tracker<N> {
     /// The map's segments have new indices.
     pub fn forget_shortlist(&mut self) {
         self.shortlist.clear();
+    }
+
+    /// The same as [`Self::track`] for a robot that may be lost: where the scan is not explained well then, it looks around.
+    pub fn locate(
+        &mut self,
+        scene: &Scene<'_>,
+        previous: &Isometry2<f32>,
+        prior: &Prior,
+        is_lost: bool,
+        watch: &mut impl FnMut(Stage),
+    ) -> Tracked {
+        let mut tracked = self.track(scene, previous, prior, watch);
+        if is_lost && tracked.hypothesis.score < scene.config.state.good_score {
+            if let Some(found) = self.look_around(scene, prior, watch) {
+                tracked.left_out = Some(left_out(&found.pose, &prior.pose));
+                tracked.hypothesis = found;
+            } else {
+                self.associate(scene, &tracked.hypothesis);
+            }
+        }
+        tracked
     }
 
     /// From the prior to the hypothesis that explains the scan best.
@@ -452,7 +473,7 @@ fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
 }
 
 /// By how much less sure a prior is to be taken that a scan overrules: covariance of (x, y, θ).
-pub(crate) fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
+fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
     let off = difference(by_scan, prior);
     off * off.transpose() * LEFT_OUT_FACTOR + variances(LEFT_OUT_FLOOR)
 }

@@ -1,6 +1,6 @@
 //! Scans as messages, and the frames that they are in.
 
-use slam_core::scan::{Mounting, Reading, SensorConfig};
+use slam_core::sensor::scan::{Mounting, Reading, SensorConfig};
 
 use super::messages::{LaserScan, Pose, TfMessage, TransformStamped};
 use super::{BASE, exact, header, nanoseconds};
@@ -102,7 +102,7 @@ fn metres(mm: u32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slam_core::scan::RangeCodes;
+    use slam_core::sensor::scan::RangeCodes;
 
     #[test]
     fn every_range_can_be_had_back() {

@@ -3,8 +3,8 @@
 //! To take a number out of a covariance every value of it must be loaded and stored. So numbers wait until there are four:
 //! what the next measurement has in common with the states is reckoned as if they had been taken out.
 
-use crate::joint::{LEAST_VARIANCE, STATES};
-use crate::math::max;
+use crate::ekf::joint::{LEAST_VARIANCE, STATES};
+use crate::geometry::math::max;
 
 /// Most numbers that wait.
 const ROOM: usize = 4;

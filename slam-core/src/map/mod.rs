@@ -3,10 +3,13 @@
 //! When it is full, the segment that is worth least gives way to the new one: scans that saw it, fewer the longer the way since.
 //! Segments of the scan at hand never do. Each eviction and each segment refused is counted.
 
+pub mod nearby;
+pub mod visibility;
+
 use heapless::Vec;
 
-use crate::math::max;
-use crate::segment::Segment;
+use crate::geometry::math::max;
+use crate::geometry::segment::Segment;
 
 /// A segment of the map, 64 bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -134,6 +137,15 @@ impl<const N: usize> SegmentMap<N> {
         kept.last_seen = kept.last_seen.max(taken.last_seen);
         kept.seen_at_m = max(kept.seen_at_m, taken.seen_at_m);
         self.counters.fused = self.counters.fused.saturating_add(1);
+    }
+
+    /// Forgets the segments that are not finite.
+    pub(crate) fn forget_broken(&mut self) {
+        for index in (0..self.segments.len()).rev() {
+            if self.segments.get(index).is_some_and(|entry| !entry.segment.is_finite()) {
+                self.forget(index);
+            }
+        }
     }
 
     /// Forgets a segment; the last one takes its place.

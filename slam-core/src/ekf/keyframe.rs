@@ -8,9 +8,9 @@
 
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
-use crate::math::sqrt;
+use crate::geometry::math::sqrt;
+use crate::geometry::pose::perpendicular;
 use crate::odometry::Increment;
-use crate::pose::perpendicular;
 
 /// When a scan becomes a keyframe.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -117,7 +117,7 @@ impl Settled {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
+    use crate::geometry::pose::pose;
 
     const CONFIG: KeyframeConfig = KeyframeConfig {
         way_m: 0.1,

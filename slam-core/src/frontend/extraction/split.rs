@@ -14,9 +14,9 @@ use nalgebra::{Point2, Vector2};
 
 use super::strip::{Frame, Sums, VarianceAcross};
 use super::{Collector, Viewpoint};
-use crate::deskew::ScanPoint;
-use crate::math::{max, min, sin_cos, sqrt};
-use crate::segment::{Moments, Segment};
+use crate::frontend::deskew::ScanPoint;
+use crate::geometry::math::{max, min, sin_cos, sqrt};
+use crate::geometry::segment::{Moments, Segment};
 
 /// Pieces waiting to be looked at. Each split adds one; deeper clusters give up their smallest detail.
 const STACK: usize = 32;

@@ -9,9 +9,9 @@
 use heapless::VecView;
 use nalgebra::{Complex, Point2};
 
-use crate::math::sin_cos;
-use crate::odometry_track::{SWEEP_KNOTS, ScanMotion};
-use crate::scan::{Reading, Scan, SensorConfig};
+use crate::geometry::math::sin_cos;
+use crate::odometry::track::{SWEEP_KNOTS, ScanMotion};
+use crate::sensor::scan::{Reading, Scan, SensorConfig};
 
 /// Most beams left out behind one that is placed.
 const MOST_LEFT_OUT: usize = 2;
@@ -155,8 +155,8 @@ impl Interval {
 mod tests {
     use super::*;
     use crate::config::SlamConfig;
+    use crate::geometry::pose::{exp, pose};
     use crate::odometry::Increment;
-    use crate::pose::{exp, pose};
     use heapless::Vec;
     use nalgebra::{Vector2, Vector3};
 

@@ -10,14 +10,14 @@
 
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
-use crate::association::Pair;
+use crate::geometry::math::{max, min, sqrt};
+use crate::geometry::pose::{components, perpendicular, pose};
+use crate::geometry::residual::{LineNoise, Residual};
+use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
-use crate::math::{max, min, sqrt};
 use crate::paper::least_squares::LeastSquaresConfig;
-use crate::pose::{components, perpendicular, pose};
-use crate::residual::{LineNoise, Residual};
-use crate::segment::Segment;
 use crate::tracking::SearchConfig;
+use crate::tracking::association::Pair;
 
 /// How the pose is corrected.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -154,7 +154,7 @@ pub fn maximum_a_posteriori(
     let prior_information = prior.covariance.cholesky()?.inverse();
     let (at, to) = (components(from.pose), components(&prior.pose));
     let mut drawn = to - at;
-    drawn.z = crate::math::wrap_angle(drawn.z);
+    drawn.z = crate::geometry::math::wrap_angle(drawn.z);
     let total = trust * information * trust + prior_information;
     let covariance = total.cholesky()?.inverse();
     let step = covariance * (trust * gradient + prior_information * drawn);
@@ -226,8 +226,10 @@ fn usable_information(weak: f32, strong: f32, direction_trust_rad: f32) -> f32 {
 
 /// Eigenvalues and unit eigenvectors of a symmetric matrix, the larger first.
 fn eigen2(m: &Matrix2<f32>) -> [(f32, Vector2<f32>); 2] {
-    let scatter =
-        crate::segment::Moments { scatter: [m.m11, m.m12, m.m22], ..crate::segment::Moments::EMPTY };
+    let scatter = crate::geometry::segment::Moments {
+        scatter: [m.m11, m.m12, m.m22],
+        ..crate::geometry::segment::Moments::EMPTY
+    };
     let strong = scatter.direction();
     let weak = perpendicular(strong);
     [(scatter.scatter_along(strong), strong), (scatter.scatter_along(weak), weak)]
@@ -250,14 +252,14 @@ pub(crate) fn largest(step: &Vector3<f32>) -> f32 {
 
 pub(crate) fn finite(correction: Correction) -> Option<Correction> {
     let covariance_is_finite = correction.covariance.iter().all(|v| v.is_finite());
-    (crate::pose::is_finite(&correction.pose) && covariance_is_finite).then_some(correction)
+    (crate::geometry::pose::is_finite(&correction.pose) && covariance_is_finite).then_some(correction)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::segment::Moments;
     use crate::paper::fixtures::{all_pairs, entries, room, wall};
-    use crate::segment::Moments;
     use nalgebra::Point2;
     use proptest::prelude::*;
     use std::vec::Vec;
@@ -302,7 +304,7 @@ mod tests {
             }
             let off = truth.inverse() * at;
             prop_assert!(off.translation.vector.norm() < 2e-3, "{}", off);
-            prop_assert!(crate::pose::heading(&off).abs() < 1e-3);
+            prop_assert!(crate::geometry::pose::heading(&off).abs() < 1e-3);
         }
     }
 
@@ -376,7 +378,7 @@ mod tests {
                         .unwrap();
                 (at, covariance) = (step.pose, step.covariance);
             }
-            crate::pose::heading(&at)
+            crate::geometry::pose::heading(&at)
         };
         let (strict, forgiving) = (heading_after(false), heading_after(true));
         assert!((forgiving - 0.06).abs() < 0.005, "{forgiving}");
@@ -391,7 +393,7 @@ mod tests {
         let mut gauss = || (0..12).map(|_| rng.next_u32() as f32 / u32::MAX as f32).sum::<f32>() - 6.0;
         let noise = LineNoise { sigma_offset_m: 0.0, sigma_direction_rad: 0.0 };
         let map = entries(
-            &room().iter().map(|s| crate::joint::with_variances(s, 1e-12, 1e-12)).collect::<Vec<_>>(),
+            &room().iter().map(|s| crate::ekf::joint::with_variances(s, 1e-12, 1e-12)).collect::<Vec<_>>(),
         );
         let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() };
         let config = GaussNewtonConfig { kernel_chi2: 1e9, direction_trust_rad: 0.0, ..config() };

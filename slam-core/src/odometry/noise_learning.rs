@@ -10,10 +10,10 @@
 
 use nalgebra::{Isometry2, Vector3};
 
-use crate::math::{max, min, sqrt, within};
+use crate::geometry::math::{max, min, sqrt, within};
+use crate::geometry::pose::{log, normalized};
+use crate::geometry::residual::LineNoise;
 use crate::odometry::{Increment, OdometryNoise};
-use crate::pose::{log, normalized};
-use crate::residual::LineNoise;
 
 /// Settings.
 #[derive(Clone, Copy, Debug, PartialEq)]

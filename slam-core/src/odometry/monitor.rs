@@ -9,9 +9,9 @@
 
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
-use crate::math::{max, sqrt};
+use crate::geometry::math::{max, sqrt};
+use crate::geometry::pose::{exp, log, normalized};
 use crate::odometry::Increment;
-use crate::pose::{exp, log, normalized};
 
 /// Settings of the monitor.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -99,7 +99,7 @@ impl OdometryMonitor {
 
     /// Takes in the motion since the scan before, by the odometry and by the scanner, where the scans fixed both poses.
     pub fn update(&mut self, by_odometry: &Increment, by_scanner: &Isometry2<f32>, config: &MonitorConfig) {
-        if !(by_odometry.is_finite() && crate::pose::is_finite(by_scanner)) {
+        if !(by_odometry.is_finite() && crate::geometry::pose::is_finite(by_scanner)) {
             return;
         }
         self.last = *by_scanner;
@@ -168,7 +168,7 @@ fn square(twist: Vector3<f32>) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
+    use crate::geometry::pose::pose;
 
     const CONFIG: MonitorConfig = MonitorConfig {
         min_score: 0.5,

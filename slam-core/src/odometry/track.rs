@@ -6,9 +6,9 @@
 use heapless::HistoryBuf;
 use nalgebra::Isometry2;
 
+use crate::geometry::pose::{exp, log, normalized};
 use crate::odometry::Increment;
-use crate::pose::{exp, log, normalized};
-use crate::scan::ScanGeometry;
+use crate::sensor::scan::ScanGeometry;
 
 /// Number of instants, evenly spread from the first to the last beam, at which a scan's motion is given.
 pub const SWEEP_KNOTS: usize = 17;
@@ -44,7 +44,7 @@ impl ScanMotion {
 
     /// Whether every number is finite.
     pub fn is_finite(&self) -> bool {
-        self.since_previous.is_finite() && self.middle_from_knot.iter().all(crate::pose::is_finite)
+        self.since_previous.is_finite() && self.middle_from_knot.iter().all(crate::geometry::pose::is_finite)
     }
 }
 
@@ -179,7 +179,7 @@ fn interpolate(before: &Knot, after: &Knot, stamp_us: u64) -> Isometry2<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::{components, pose};
+    use crate::geometry::pose::{components, pose};
     use core::f32::consts::PI;
 
     fn arc_track() -> OdometryTrack<8> {

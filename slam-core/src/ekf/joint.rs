@@ -17,12 +17,12 @@ use core::ops::Range;
 
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
+use crate::ekf::told::{self, Told};
+use crate::geometry::math::{max, within};
+use crate::geometry::pose::{components, cross, perpendicular, pose};
+use crate::geometry::segment::Segment;
 use crate::map::SegmentMap;
-use crate::math::{max, within};
-use crate::odometry_bias::OdometryBias;
-use crate::pose::{components, cross, perpendicular, pose};
-use crate::segment::Segment;
-use crate::told::{self, Told};
+use crate::odometry::bias::OdometryBias;
 
 /// Most map segments whose errors are tracked together: 48.
 pub const LINES: usize = 48;
@@ -889,8 +889,8 @@ fn by_pose(normal: Vector2<f32>, from_robot: Vector2<f32>) -> [[f32; 3]; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::pose::rotate_covariance;
     use crate::odometry::{Increment, OdometryNoise};
-    use crate::pose::rotate_covariance;
     use nalgebra::Point2;
     use rand_core::{Rng, SeedableRng};
 
@@ -1005,7 +1005,7 @@ mod tests {
 
         fn nees(&self) -> f32 {
             let mut off = components(&self.believed) - components(&self.truth);
-            off.z = crate::math::wrap_angle(off.z);
+            off.z = crate::geometry::math::wrap_angle(off.z);
             off.dot(&(self.joint.pose_covariance().try_inverse().unwrap() * off))
         }
     }
@@ -1202,7 +1202,7 @@ mod tests {
                 world.joint.set(state, state, spoilt);
             }
             let pose = world.joint.settle(&world.believed, &mut world.map);
-            assert!(crate::pose::is_finite(&pose));
+            assert!(crate::geometry::pose::is_finite(&pose));
             assert!(world.map.segments().iter().all(|s| s.segment.is_finite()), "{spoilt}");
         }
     }

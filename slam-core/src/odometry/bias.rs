@@ -2,12 +2,12 @@
 //!
 //! A scan corrects only a part of a prediction's error, so a constant error of the odometry would leave the pose behind
 //! by a constant, and each new wall with it. Three of them are estimated together with the pose, see
-//! [`Joint`](crate::joint::Joint): a scale of the distance, a scale of the turn, and a turn for each metre (unequal wheels).
+//! [`Joint`](crate::ekf::joint::Joint): a scale of the distance, a scale of the turn, and a turn for each metre (unequal wheels).
 
 use nalgebra::{Matrix3, Vector3};
 
+use crate::geometry::pose::{exp, log, perpendicular};
 use crate::odometry::Increment;
-use crate::pose::{exp, log, perpendicular};
 
 /// How large the errors may be before anything is learnt.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -69,7 +69,7 @@ impl OdometryBias {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::components;
+    use crate::geometry::pose::components;
     use proptest::prelude::*;
 
     proptest! {

@@ -109,9 +109,9 @@ fn sector(direction: Vector2<f32>) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::sin_cos;
-    use crate::pose::pose;
-    use crate::segment::Segment;
+    use crate::geometry::math::sin_cos;
+    use crate::geometry::pose::pose;
+    use crate::geometry::segment::Segment;
     use nalgebra::Point2;
     use proptest::prelude::*;
     use std::collections::BTreeSet;

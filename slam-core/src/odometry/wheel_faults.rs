@@ -6,9 +6,9 @@
 
 use nalgebra::Isometry2;
 
-use crate::math::max;
+use crate::geometry::math::max;
+use crate::geometry::pose::log;
 use crate::odometry::Increment;
-use crate::pose::log;
 
 /// A fault of wheels or encoders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -153,7 +153,7 @@ impl WheelMonitor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::exp;
+    use crate::geometry::pose::exp;
     use nalgebra::Vector3;
 
     const TRACK_M: f32 = 0.3;

@@ -14,10 +14,10 @@ use nalgebra::Point2;
 
 pub use split::SplitConfig;
 
-use crate::deskew::ScanPoint;
+use crate::frontend::deskew::ScanPoint;
+use crate::geometry::segment::Segment;
 use crate::paper::ransac::{self, RansacConfig};
-use crate::scan::SensorConfig;
-use crate::segment::Segment;
+use crate::sensor::scan::SensorConfig;
 
 /// Most segments kept of one scan: 64, 52 bytes each.
 pub const MAX_SEGMENTS: usize = 64;
@@ -123,16 +123,16 @@ mod tests {
         use rand_core::{Rng, SeedableRng};
         let mut rng = rand_pcg::Pcg32::seed_from_u64(3);
         let mut gauss = || (0..12).map(|_| rng.next_u32() as f32 / u32::MAX as f32).sum::<f32>() - 6.0;
-        let geometry = crate::scan::ScanGeometry::URG_04LX;
+        let geometry = crate::sensor::scan::ScanGeometry::URG_04LX;
         let mut points = StdVec::new();
         for beam in 0..geometry.beams() {
-            let (s, c) = crate::math::sin_cos(geometry.bearing(beam));
+            let (s, c) = crate::geometry::math::sin_cos(geometry.bearing(beam));
             let direction = Vector2::new(c, s);
             let hit = walls.iter().filter_map(|&((x1, y1), (x2, y2))| {
                 let (from, along) = (Vector2::new(x1, y1), Vector2::new(x2 - x1, y2 - y1));
-                let denominator = crate::pose::cross(direction, along);
-                let range = crate::pose::cross(from, along) / denominator;
-                let share = crate::pose::cross(from, direction) / denominator;
+                let denominator = crate::geometry::pose::cross(direction, along);
+                let range = crate::geometry::pose::cross(from, along) / denominator;
+                let share = crate::geometry::pose::cross(from, direction) / denominator;
                 ((0.0..=1.0).contains(&share) && range > 0.0).then_some(range)
             });
             let range = hit.fold(f32::INFINITY, f32::min);
@@ -203,7 +203,7 @@ mod tests {
         let post: StdVec<_> = (0..24)
             .map(|k| {
                 let at = |k: i32| {
-                    let (s, c) = crate::math::sin_cos(k as f32 * core::f32::consts::PI / 12.0);
+                    let (s, c) = crate::geometry::math::sin_cos(k as f32 * core::f32::consts::PI / 12.0);
                     (2.0 + 0.12 * c, 0.12 * s)
                 };
                 (at(k), at(k + 1))
@@ -216,7 +216,7 @@ mod tests {
     /// A round post of this radius, seen from the origin.
     fn post(centre: (f32, f32), radius_m: f32) -> StdVec<Wall> {
         let at = |k: i32| {
-            let (s, c) = crate::math::sin_cos(k as f32 * core::f32::consts::PI / 24.0);
+            let (s, c) = crate::geometry::math::sin_cos(k as f32 * core::f32::consts::PI / 24.0);
             (centre.0 + radius_m * c, centre.1 + radius_m * s)
         };
         (0..48).map(|k| (at(k), at(k + 1))).collect()

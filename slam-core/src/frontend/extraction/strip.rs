@@ -6,10 +6,10 @@
 use nalgebra::{Point2, Vector2};
 
 use super::Viewpoint;
-use crate::deskew::ScanPoint;
-use crate::math::{max, sqrt};
-use crate::pose::perpendicular;
-use crate::segment::Moments;
+use crate::frontend::deskew::ScanPoint;
+use crate::geometry::math::{max, sqrt};
+use crate::geometry::pose::perpendicular;
+use crate::geometry::segment::Moments;
 
 /// The variance of a point across a surface, prepared for many points: range noise acts along the beam, the beam's own
 /// uncertain bearing and its width across it.
@@ -204,7 +204,7 @@ impl Sums {
 mod tests {
     use super::*;
     use crate::SlamConfig;
-    use crate::extraction::tests::variance_across;
+    use crate::frontend::extraction::tests::variance_across;
     use proptest::prelude::*;
     use std::vec::Vec;
 
@@ -212,7 +212,7 @@ mod tests {
     fn wall() -> impl Strategy<Value = Vec<ScanPoint>> {
         let offsets = proptest::collection::vec(-0.03f32..0.03, 3..80);
         (offsets, 0.3f32..4.0, -2.0f32..2.0, -3.0f32..3.0).prop_map(|(offsets, distance, begin, turn)| {
-            let at = crate::pose::pose(0.0, 0.0, turn);
+            let at = crate::geometry::pose::pose(0.0, 0.0, turn);
             let points = offsets.iter().enumerate().map(|(k, off)| {
                 let position = at * Point2::new(distance + off, begin + 0.02 * k as f32);
                 ScanPoint { position, range_m: position.coords.norm(), beam: k as u16 }
@@ -224,7 +224,7 @@ mod tests {
     proptest! {
         #[test]
         fn the_variance_is_the_plain_one(points in wall()) {
-            let sensor = crate::extraction::tests::sensor();
+            let sensor = crate::frontend::extraction::tests::sensor();
             let view = Viewpoint::new(&sensor);
             let frame = Frame::of_chord(&points, &view).unwrap();
             let prepared = VarianceAcross::new(&view);
@@ -239,7 +239,7 @@ mod tests {
 
         #[test]
         fn the_sums_are_the_plain_ones(points in wall(), cut in 1usize..80) {
-            let sensor = crate::extraction::tests::sensor();
+            let sensor = crate::frontend::extraction::tests::sensor();
             let view = Viewpoint::new(&sensor);
             let frame = Frame::of_chord(&points, &view).unwrap();
             let prepared = VarianceAcross::new(&view);

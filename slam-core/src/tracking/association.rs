@@ -9,14 +9,14 @@
 use heapless::{Vec, VecView};
 use nalgebra::{Isometry2, Matrix3, Point2, Vector2};
 
-use crate::extraction::MAX_SEGMENTS;
+use crate::frontend::extraction::MAX_SEGMENTS;
+use crate::geometry::math::{min, sqrt};
+use crate::geometry::pose::cross;
+use crate::geometry::residual::{LineNoise, Residual};
+use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
-use crate::math::{min, sqrt};
-use crate::nearby::Nearby;
+use crate::map::nearby::Nearby;
 use crate::paper::bisector::{BisectorConfig, bisector_distance};
-use crate::pose::cross;
-use crate::residual::{LineNoise, Residual};
-use crate::segment::Segment;
 
 /// How pairs are found.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -236,7 +236,7 @@ fn gated_chi2(observed: &Segment, mapped: &Segment, view: &View<'_>, config: &Ga
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
+    use crate::geometry::pose::pose;
     use proptest::prelude::*;
 
     const NOISE: LineNoise = LineNoise { sigma_offset_m: 0.005, sigma_direction_rad: 0.002 };
@@ -244,9 +244,9 @@ mod tests {
     /// A segment seen from a point on its left.
     fn wall(from: (f32, f32), to: (f32, f32)) -> Segment {
         let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
-        let left = nalgebra::center(&from, &to) + crate::pose::perpendicular(to - from);
+        let left = nalgebra::center(&from, &to) + crate::geometry::pose::perpendicular(to - from);
         let points = (0..40).map(|i| (from + (to - from) * (i as f32 / 39.0), 1e4));
-        Segment::fitted(crate::segment::Moments::from_points(points), &[from, to], left)
+        Segment::fitted(crate::geometry::segment::Moments::from_points(points), &[from, to], left)
     }
 
     fn pair(observed: &Segment, map: &[Segment], config: &AssociationConfig, sigma_m: f32) -> Option<usize> {

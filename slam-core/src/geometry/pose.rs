@@ -4,7 +4,7 @@
 
 use nalgebra::{Complex, Isometry2, Matrix3, Translation2, UnitComplex, Vector2, Vector3};
 
-use crate::math::{atan2, sin_cos, wrap_angle};
+use crate::geometry::math::{atan2, sin_cos, wrap_angle};
 
 /// The pose `(x, y, θ)` as an isometry; metres, radians.
 #[inline]
@@ -39,7 +39,8 @@ pub fn is_finite(pose: &Isometry2<f32>) -> bool {
 }
 
 /// The pose rebuilt from its components, so that the rotation stays a rotation however many were multiplied.
-#[inline]
+// Not inlined: on the microcontroller that is a kilobyte of flash less.
+#[inline(never)]
 pub fn normalized(pose: &Isometry2<f32>) -> Isometry2<f32> {
     let c = components(pose);
     self::pose(c.x, c.y, c.z)

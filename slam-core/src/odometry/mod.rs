@@ -7,9 +7,16 @@
 //! The paper treats the prediction as exact up to a search window. Here each increment carries a covariance whose
 //! variances grow in proportion to the way travelled, so that it does not depend on how a path was cut into steps.
 
+pub mod bias;
+pub(crate) mod health;
+pub mod monitor;
+pub mod noise_learning;
+pub mod track;
+pub mod wheel_faults;
+
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
-use crate::pose::{self, exp};
+use crate::geometry::pose::{self, exp};
 
 /// Difference of two readings of a free-running 16-bit counter, right as long as it moved less than half its range.
 #[inline]
@@ -111,7 +118,7 @@ impl Increment {
         let way = pose::log(&before_from_after);
         Self {
             before_from_after,
-            distance_m: crate::math::sqrt(way.x * way.x + way.y * way.y),
+            distance_m: crate::geometry::math::sqrt(way.x * way.x + way.y * way.y),
             turn_rad: way.z.abs(),
         }
     }
@@ -156,6 +163,8 @@ impl OdometryNoise {
     ///
     /// Heading errors are taken as spread evenly over the way: they move the end sideways, with the covariance
     /// d/2 and d²/3 of integrated white noise.
+    // Not inlined: on the microcontroller that is less flash.
+    #[inline(never)]
     pub fn covariance(&self, increment: &Increment) -> Matrix3<f32> {
         let (d, turn) = (increment.distance_m, increment.turn_rad);
         let square = |v: f32| v * v;
@@ -165,7 +174,7 @@ impl OdometryNoise {
         let var_across = square(self.sigma_across_m_per_sqrt_m) * d;
         // Axes of the chord travelled; at rest, those of the base.
         let chord = increment.before_from_after.translation.vector;
-        let length = crate::math::sqrt(chord.norm_squared());
+        let length = crate::geometry::math::sqrt(chord.norm_squared());
         let (c, s) = if length > 1e-6 { (chord.x / length, chord.y / length) } else { (1.0, 0.0) };
         // What a heading error does to the end of the chord.
         let lever = pose::perpendicular(chord);

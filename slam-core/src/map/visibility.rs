@@ -8,10 +8,10 @@
 
 use nalgebra::{Isometry2, Vector2};
 
+use crate::geometry::math::{atan2, sqrt};
+use crate::geometry::segment::Segment;
 use crate::map::{MapSegment, SegmentMap};
-use crate::math::{atan2, sqrt};
-use crate::scan::{Reading, Scan, SensorConfig};
-use crate::segment::Segment;
+use crate::sensor::scan::{Reading, Scan, SensorConfig};
 
 /// Settings of forgetting.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -6,9 +6,9 @@
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Vector2};
 
-use crate::math::min;
-use crate::pose::{cross, perpendicular};
-use crate::segment::Segment;
+use crate::geometry::math::min;
+use crate::geometry::pose::{cross, perpendicular};
+use crate::geometry::segment::Segment;
 
 /// Error of a line that does not average out over its points: walls are not straight, sensors have a bias.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -99,8 +99,8 @@ impl Residual {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
-    use crate::segment::Moments;
+    use crate::geometry::pose::pose;
+    use crate::geometry::segment::Moments;
     use proptest::prelude::*;
 
     fn wall(points: usize, noise: impl Fn(usize) -> f32) -> Segment {
@@ -139,7 +139,7 @@ mod tests {
     #[test]
     fn information_is_that_of_point_to_line_least_squares() {
         let mut map = wall(40, |_| 0.0);
-        map = crate::joint::with_variances(&map, 1e-12, 1e-12); // a map line known perfectly
+        map = crate::ekf::joint::with_variances(&map, 1e-12, 1e-12); // a map line known perfectly
         let observed = wall(25, |_| 0.0);
         let position = Point2::new(0.3, -0.2);
         let r = Residual::new(&observed, &map, position, &NOISE).unwrap();

@@ -9,17 +9,18 @@
 use heapless::Vec;
 use nalgebra::{Isometry2, Point2, Vector3};
 
-use crate::association::Pair;
-use crate::extraction::MAX_SEGMENTS;
-use crate::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
-use crate::keyframe::KeyframeConfig;
+use crate::config::SlamConfig;
+use crate::ekf::joint::{Joint, Learning, Measurement, Trust, variances, with_variances};
+use crate::ekf::keyframe::KeyframeConfig;
+use crate::frontend::extraction::MAX_SEGMENTS;
+use crate::geometry::math::{max, min};
+use crate::geometry::pose::{cross, difference, is_finite};
+use crate::geometry::residual::{LineNoise, Residual};
+use crate::geometry::segment::Segment;
+use crate::map::nearby::Nearby;
 use crate::map::{MapSegment, SegmentMap};
-use crate::math::{max, min};
-use crate::nearby::Nearby;
 use crate::paper::end_points::EndPointsConfig;
-use crate::pose::{cross, difference, is_finite};
-use crate::residual::{LineNoise, Residual};
-use crate::segment::Segment;
+use crate::tracking::association::Pair;
 
 /// Most sightings of a keyframe that are taken in.
 pub const MAX_TAKEN: usize = 12;
@@ -35,6 +36,16 @@ pub enum RegistrationConfig {
     EndPoints(EndPointsConfig),
     /// Lines are estimated together with the pose, walls fused.
     Joint(JointConfig),
+}
+
+impl RegistrationConfig {
+    /// Settings of the joint estimate, where there is one.
+    pub(crate) fn joint(&self) -> Option<&JointConfig> {
+        match self {
+            Self::EndPoints(_) => None,
+            Self::Joint(config) => Some(config),
+        }
+    }
 }
 
 /// Settings of the joint estimate.
@@ -133,6 +144,12 @@ pub struct Eye {
     pub reach_m: f32,
     /// Errors of lines beyond their points' noise.
     pub line_noise: LineNoise,
+}
+
+impl Eye {
+    pub(crate) fn of(config: &SlamConfig) -> Self {
+        Self { reach_m: config.sensor.reach_m(), line_noise: config.line_noise }
+    }
 }
 
 impl Observed<'_> {
@@ -474,10 +491,10 @@ fn distance_m(long: &Segment, short: &Segment) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::pose::components;
+    use crate::geometry::pose::{perpendicular, pose};
+    use crate::geometry::segment::Moments;
     use crate::paper::end_points::{EndPointWeight, register_end_points};
-    use crate::pose::components;
-    use crate::pose::{perpendicular, pose};
-    use crate::segment::Moments;
     use nalgebra::{Matrix3, Vector3};
     use std::vec::Vec as StdVec;
 

@@ -9,8 +9,8 @@
 
 use nalgebra::{Isometry2, Point2, Vector2};
 
-use crate::math::{max, min, sqrt};
-use crate::pose::{cross, perpendicular};
+use crate::geometry::math::{max, min, sqrt};
+use crate::geometry::pose::{cross, perpendicular};
 
 /// Weighted sums over points of the plane. A weight is the inverse variance of the point, 1/m².
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -272,7 +272,7 @@ impl Segment {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pose::pose;
+    use crate::geometry::pose::pose;
     use proptest::prelude::*;
     use std::vec::Vec;
 

@@ -1,0 +1,507 @@
+//! Where the robot is and how sure that is: the one owner of the pose and of all that it stands on.
+//!
+//! In: motions by the odometry, the pose that tracking finds, segments and pairs of a scan. Out: the pose of `base` in `map` with
+//! its covariance, and a map that is moved with it.
+//!
+//! Scan by scan the pose is tracked among lines that stand still; the local covariance is its own error among them. Of
+//! [`keyframe`](crate::ekf::keyframe)s an extended Kalman filter, the [`Joint`] estimate, takes in what was seen, a few sightings with
+//! each scan, and gathers in its error state what they say of pose, odometry and lines. [`Estimator::commit`] injects the error
+//! state: pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
+
+use nalgebra::{Isometry2, Matrix3, Vector3};
+
+use crate::config::SlamConfig;
+use crate::ekf::joint::Joint;
+use crate::ekf::keyframe::{AmongLines, Keyframe, KeyframeConfig, Settled};
+use crate::ekf::registration::{
+    Eye, JointConfig, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start,
+};
+use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covariance};
+use crate::geometry::residual::LineNoise;
+use crate::geometry::segment::Segment;
+use crate::loop_closure::Closure;
+use crate::map::SegmentMap;
+use crate::odometry::Increment;
+use crate::odometry::bias::OdometryBias;
+use crate::odometry::health::OdometryHealth;
+use crate::odometry::track::ScanMotion;
+use crate::paper::end_points::register_end_points;
+use crate::tracking::correction::Prior;
+use crate::tracking::{Hypothesis, Tracker, TrackingState};
+use crate::update::SlamUpdate;
+
+/// What the estimator works with and does not own.
+pub(crate) struct Surroundings<'a, const N: usize> {
+    /// The settings of all stages.
+    pub config: &'a SlamConfig,
+    /// How far the odometry is to be believed.
+    pub odometry: &'a OdometryHealth,
+    /// Segments of the scan at hand, in `base`.
+    pub observed: &'a [Segment],
+    /// The lines that are estimated with the pose.
+    pub map: &'a mut SegmentMap<N>,
+    /// Those around the robot, and their pairs among the segments.
+    pub tracker: &'a mut Tracker<N>,
+}
+
+/// The pose, its covariance, the filter, and where the filter stands.
+///
+/// RAM: 24 KiB.
+pub(crate) struct Estimator {
+    map_from_base: Isometry2<f32>,
+    /// Of the pose among the lines around it; what they have in common with it is the filter's.
+    local_covariance: Matrix3<f32>,
+    /// The filter; none with the paper's registration.
+    joint: Option<Joint>,
+    /// Where the filter stands, and the odometry since.
+    keyframe: Keyframe,
+    /// Of the keyframe, on their way into the filter.
+    sightings: Sightings,
+    /// Where the filter's error state was injected last, and how sure it was of the pose then.
+    settled: Settled,
+    /// Scans before the one at hand.
+    scans: u32,
+    travelled_m: f32,
+}
+
+/// Where a motion leads.
+struct Moved {
+    pose: Isometry2<f32>,
+    /// Jacobian of the new pose by the old one.
+    by_pose: Matrix3<f32>,
+    /// Covariance that the motion adds.
+    noise: Matrix3<f32>,
+}
+
+impl Estimator {
+    /// At the origin and sure of it, without a filter. Inlined, so that it is built in its place.
+    #[inline(always)]
+    pub fn blank() -> Self {
+        Self {
+            map_from_base: Isometry2::identity(),
+            local_covariance: Matrix3::zeros(),
+            joint: None,
+            keyframe: Keyframe::at(Isometry2::identity(), AmongLines::default()),
+            sightings: Sightings::default(),
+            settled: Settled::default(),
+            scans: 0,
+            travelled_m: 0.0,
+        }
+    }
+
+    /// Makes the filter that the configuration asks for.
+    pub fn prepare(&mut self, config: &SlamConfig) {
+        if config.registration.joint().is_some() {
+            self.joint.insert(Joint::blank()).prepare(config.odometry.bias_sigmas());
+        }
+    }
+
+    /// Pose of `base` in `map`.
+    pub fn pose(&self) -> Isometry2<f32> {
+        self.map_from_base
+    }
+
+    /// The pose with its covariance (x, y, θ) among the lines around it, in `map`.
+    pub fn local(&self) -> Prior {
+        Prior { pose: self.map_from_base, covariance: self.local_covariance }
+    }
+
+    /// Covariance of the pose (x, y, θ), in `map`, the error of the lines around it included.
+    pub fn covariance(&self, line_noise: &LineNoise) -> Matrix3<f32> {
+        if self.joint.is_none() {
+            return self.local_covariance;
+        }
+        // What the walls that were seen have in common does not average out over many of them.
+        let in_common = line_noise.var_offset();
+        self.settled.carried(&self.map_from_base)
+            + self.settled.grown(&self.local_covariance)
+            + Matrix3::from_diagonal(&Vector3::new(in_common, in_common, 0.0))
+    }
+
+    /// Covariance of the keyframe's pose by the filter, if there is one.
+    pub fn filter_covariance(&self) -> Option<Matrix3<f32>> {
+        self.joint.as_ref().map(Joint::pose_covariance)
+    }
+
+    /// Systematic errors of the odometry as learnt so far.
+    pub fn odometry_bias(&self) -> OdometryBias {
+        self.joint.as_ref().map_or_else(OdometryBias::default, Joint::bias)
+    }
+
+    /// Way driven until now, metres.
+    pub fn travelled_m(&self) -> f32 {
+        self.travelled_m
+    }
+
+    /// Scans before the one at hand.
+    pub fn scans(&self) -> u32 {
+        self.scans
+    }
+
+    /// The scan at hand, as the map counts: from one, so that zero is a scan that never was.
+    pub fn stamp(&self) -> Stamp {
+        Stamp { scan: self.scans.saturating_add(1), way_m: self.travelled_m }
+    }
+
+    /// The scan at hand is over.
+    pub fn end_scan(&mut self) {
+        self.scans = self.scans.saturating_add(1);
+    }
+
+    /// Eq. (1) with covariance: moves the pose by the odometry. False where a number is not finite: the robot is then taken to
+    /// stand still, unsure by a metre and a radian.
+    pub fn predict<const N: usize>(&mut self, motion: &ScanMotion, around: &mut Surroundings<'_, N>) -> bool {
+        let moved = self.moved(&self.map_from_base, &motion.since_previous, around);
+        let covariance = moved.by_pose * self.local_covariance * moved.by_pose.transpose() + moved.noise;
+        if !(motion.is_finite() && is_finite(&moved.pose) && covariance.iter().all(|v| v.is_finite())) {
+            self.local_covariance = Matrix3::identity();
+            self.inflate_filter(&Matrix3::identity(), around);
+            return false;
+        }
+        (self.map_from_base, self.local_covariance) = (moved.pose, covariance);
+        self.keyframe.since = self.keyframe.since.then(&motion.since_previous);
+        self.keyframe.scans = self.keyframe.scans.saturating_add(1);
+        self.travelled_m += motion.since_previous.distance_m;
+        if self.keyframe_is_due(&around.config.registration) {
+            self.commit(around);
+        }
+        true
+    }
+
+    /// Moves on by odometry alone, where no scan has come. False as in [`Self::predict`].
+    pub fn coast<const N: usize>(&mut self, motion: &Increment, around: &mut Surroundings<'_, N>) -> bool {
+        let is_usable = self.predict(&ScanMotion::instantaneous(*motion), around);
+        if self.keyframe_is_due(&around.config.registration) {
+            self.advance(around);
+            self.note_settled();
+        }
+        is_usable
+    }
+
+    /// Takes the pose that tracking found.
+    pub fn accept(&mut self, hypothesis: &Hypothesis) {
+        (self.map_from_base, self.local_covariance) = (hypothesis.pose, hypothesis.covariance);
+    }
+
+    /// Makes the pose less sure by a covariance of (x, y, θ) in `map`.
+    pub fn inflate<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) {
+        self.local_covariance += by;
+        self.inflate_filter(by, around);
+    }
+
+    /// The same of the filter's pose only: that of the scan at hand is known from the scan.
+    fn inflate_filter<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) {
+        self.commit(around);
+        if let Some(joint) = &mut self.joint {
+            joint.loosen_pose(by, around.map);
+        }
+        self.keyframe.among_lines = self.keyframe.among_lines.plus(by);
+        self.note_settled();
+    }
+
+    /// The filter goes on from where a scan says that overruled the prediction, so much less sure (covariance of (x, y, θ)): what
+    /// the odometry said since the keyframe does not count.
+    pub fn overrule<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) {
+        self.inflate_filter(by, around);
+        let moved = self.keyframe.map_from_base.inverse() * self.map_from_base;
+        self.keyframe.since.before_from_after = normalized(&moved);
+    }
+
+    /// Takes in what is left of the last keyframe's sightings and injects the error state: pose and lines move at once, and lines
+    /// that turn out to be one wall are fused. Without sightings nothing happens.
+    pub fn commit<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) {
+        let Some(config) = around.config.registration.joint() else { return };
+        let Some(joint) = &mut self.joint else { return };
+        let (eye, near) = (Eye::of(around.config), &mut around.tracker.nearby);
+        let Some([before, after]) = self.sightings.settle(&eye, config, joint, around.map, near) else {
+            return;
+        };
+        // Fusing has renumbered the map's segments.
+        around.tracker.forget_shortlist();
+        self.keyframe.map_from_base = after;
+        self.note_settled();
+        self.map_from_base = after * before.inverse() * self.map_from_base;
+    }
+
+    /// Whether the scan at hand is to be taken into the map.
+    pub fn keyframe_is_due(&self, config: &RegistrationConfig) -> bool {
+        config.joint().is_none_or(|config| self.keyframe.is_due(self.scans, &config.keyframes))
+    }
+
+    /// How close to each other the points of the scan at hand need not be, metres.
+    pub fn spacing_m(&self, config: &RegistrationConfig) -> f32 {
+        match config.joint() {
+            Some(joint) if !self.keyframe_is_due(config) => joint.keyframes.spacing_between_m,
+            _ => 0.0,
+        }
+    }
+
+    /// From pairs to map, and with the filter to the pose. `update` is what has come of the scan so far.
+    pub fn register<const N: usize>(
+        &mut self,
+        update: &SlamUpdate,
+        around: &mut Surroundings<'_, N>,
+    ) -> RegistrationReport {
+        let config = around.config;
+        match &config.registration {
+            RegistrationConfig::EndPoints(end_points) => {
+                let (segments, pairs) = (around.observed, &*around.tracker.pairs);
+                let seen = Observed { segments, pairs, stamp: self.stamp(), eye: Eye::of(config) };
+                register_end_points(&seen, &self.map_from_base, end_points, around.map)
+            }
+            RegistrationConfig::Joint(joint) => {
+                let is_due = self.keyframe_is_due(&config.registration);
+                if update.closure.is_some() || is_due && self.admits(update, &joint.keyframes, around) {
+                    self.take_keyframe(update.closure.as_ref(), joint, around)
+                } else {
+                    self.go_on_with_keyframe(joint, around)
+                }
+            }
+        }
+    }
+
+    /// Whether a scan may enter the map: one that is explained, or that the robot has waited for long enough; none while it is lost.
+    fn admits<const N: usize>(
+        &self,
+        update: &SlamUpdate,
+        config: &KeyframeConfig,
+        around: &Surroundings<'_, N>,
+    ) -> bool {
+        let since = &self.keyframe.since;
+        let waited = self.keyframe.scans >= config.scans_below
+            || since.distance_m + since.turn_rad >= config.way_below_m;
+        let at_start = self.scans <= config.at_start || around.tracker.nearby.all().is_empty();
+        update.state != TrackingState::Lost && (update.support >= config.min_score || waited || at_start)
+    }
+
+    /// Makes the scan at hand the keyframe. Its sightings are taken in from the next scan on, unless keyframes follow each other or a
+    /// loop was closed.
+    fn take_keyframe<const N: usize>(
+        &mut self,
+        closure: Option<&Closure>,
+        config: &JointConfig,
+        around: &mut Surroundings<'_, N>,
+    ) -> RegistrationReport {
+        let in_a_row = self.keyframe.scans <= 1;
+        let advanced = self.advance(around);
+        // A closed loop has moved the prediction with the map.
+        let carried = closure.map(|closure| closure.closed * closure.drifted.inverse());
+        let prior = carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced);
+        self.keyframe = Keyframe::at(prior, AmongLines::of(&self.local_covariance));
+        let start = Start { prior: &prior, pose: &self.map_from_base };
+        let seen = Observed {
+            segments: around.observed,
+            pairs: &around.tracker.pairs,
+            stamp: self.stamp(),
+            eye: Eye::of(around.config),
+        };
+        let Some(joint) = &mut self.joint else { return RegistrationReport::default() };
+        let mut report = self.sightings.make(&seen, &start, config, joint, around.map);
+        if in_a_row || closure.is_some() {
+            self.commit(around);
+            report.settled = true;
+        }
+        report
+    }
+
+    /// Takes in some sightings of the keyframe; once all are in, the error state is injected.
+    fn go_on_with_keyframe<const N: usize>(
+        &mut self,
+        config: &JointConfig,
+        around: &mut Surroundings<'_, N>,
+    ) -> RegistrationReport {
+        let mut report = RegistrationReport::default();
+        let Some(joint) = self.joint.as_mut().filter(|_| self.sightings.wait()) else { return report };
+        if !self.sightings.take_in(config.taken_per_scan.into(), config, joint) {
+            self.commit(around);
+            report.settled = true;
+        }
+        report
+    }
+
+    /// Forgets a line of the map.
+    pub fn forget_line<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) {
+        map.forget(index);
+        if let Some(joint) = &mut self.joint {
+            joint.removed(index, map.segments().len(), map);
+        }
+    }
+
+    /// Begins anew at a pose that is taken as certain.
+    pub fn begin_at(&mut self, map_from_base: Isometry2<f32>, config: &SlamConfig) {
+        self.map_from_base = map_from_base;
+        self.local_covariance = Matrix3::zeros();
+        self.begin_anew(config);
+    }
+
+    /// Begins anew from where the robot stands. Of the filter only the odometry's errors stay.
+    pub fn begin_anew(&mut self, config: &SlamConfig) {
+        if let Some(joint) = &mut self.joint {
+            joint.clear(config.odometry.bias_sigmas());
+        }
+        self.sightings.clear();
+        self.keyframe = Keyframe::at(self.map_from_base, AmongLines::default());
+        self.note_settled();
+    }
+
+    /// Puts the pose in order after a reset that may have come while it was written. False where it is lost.
+    pub fn recover_pose(&mut self) -> bool {
+        let is_whole = is_finite(&self.map_from_base) && self.local_covariance.iter().all(|v| v.is_finite());
+        if is_whole {
+            self.map_from_base = normalized(&self.map_from_base);
+        }
+        is_whole
+    }
+
+    /// Moves the filter's pose on by what the odometry said since the last keyframe. Returns it.
+    fn advance<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) -> Isometry2<f32> {
+        let last = self.keyframe;
+        let moved = self.moved(&last.map_from_base, &last.since, around);
+        if let Some(joint) = &mut self.joint {
+            let turn = last.map_from_base.rotation.to_rotation_matrix().to_homogeneous();
+            let by_odometry = turn * OdometryBias::derivative(&last.since);
+            joint.predict(&moved.by_pose, &by_odometry, &moved.noise, around.map);
+        }
+        // Of no scan yet: the pose may have been corrected since.
+        let among_lines = AmongLines::of(&self.local_covariance);
+        self.keyframe = Keyframe { scans: 1, ..Keyframe::at(moved.pose, among_lines) };
+        moved.pose
+    }
+
+    /// Where an increment of the odometry leads from a pose.
+    fn moved<const N: usize>(
+        &self,
+        from: &Isometry2<f32>,
+        increment: &Increment,
+        around: &Surroundings<'_, N>,
+    ) -> Moved {
+        let increment = self.odometry_bias().corrected(increment);
+        let pose = normalized(&(from * increment.before_from_after));
+        let lever = perpendicular(from.rotation * increment.before_from_after.translation.vector);
+        let mut by_pose = Matrix3::identity();
+        (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
+        let noise = around.odometry.covariance(&increment, &around.config.odometry);
+        Moved { pose, by_pose, noise: rotate_covariance(from, &noise) }
+    }
+
+    /// The filter stands at the keyframe, with nothing left to be taken in.
+    fn note_settled(&mut self) {
+        if let Some(joint) = &self.joint {
+            let position = self.keyframe.map_from_base.translation.vector;
+            let covariance = joint.pose_covariance();
+            self.settled = Settled { position, covariance, among_lines: self.keyframe.among_lines };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::pose::{components, difference, pose};
+    use nalgebra::Point2;
+
+    /// All that an estimator works with, around a robot that has seen nothing.
+    struct Robot {
+        config: SlamConfig,
+        odometry: OdometryHealth,
+        map: SegmentMap<8>,
+        tracker: Tracker<8>,
+        estimator: Estimator,
+    }
+
+    impl Robot {
+        fn new(config: SlamConfig) -> Self {
+            let mut estimator = Estimator::blank();
+            estimator.prepare(&config);
+            let odometry = OdometryHealth::new(config.line_noise, config.odometry.noise);
+            Self { config, odometry, map: SegmentMap::new(), tracker: Tracker::new(), estimator }
+        }
+
+        fn with<'a>(&'a mut self, observed: &'a [Segment]) -> (&'a mut Estimator, Surroundings<'a, 8>) {
+            let Self { config, odometry, map, tracker, estimator } = self;
+            (estimator, Surroundings { config, odometry, observed, map, tracker })
+        }
+
+        /// A scan that changes nothing of the pose.
+        fn see(&mut self, observed: &[Segment]) -> RegistrationReport {
+            let (estimator, mut around) = self.with(observed);
+            let update = SlamUpdate::predicted(&estimator.local(), TrackingState::Tracking);
+            let report = estimator.register(&update, &mut around);
+            estimator.end_scan();
+            report
+        }
+
+        fn go(&mut self, x: f32, y: f32, turn: f32) -> bool {
+            let (estimator, mut around) = self.with(&[]);
+            let increment = Increment::from_motion(pose(x, y, turn));
+            estimator.predict(&ScanMotion::instantaneous(increment), &mut around)
+        }
+    }
+
+    fn wall() -> Segment {
+        Segment::from_ends(Point2::new(2.0, -1.0), Point2::new(2.0, 1.0), 40, 1e-4, Point2::origin())
+    }
+
+    #[test]
+    fn the_motion_s_jacobian_is_the_finite_difference() {
+        let mut robot = Robot::new(SlamConfig::default());
+        let (estimator, around) = robot.with(&[]);
+        let increment = Increment::from_motion(pose(0.3, 0.05, 0.4));
+        for from in [Vector3::new(1.0, -2.0, 0.7), Vector3::new(-3.0, 0.5, 3.1)] {
+            let at = |off: Vector3<f32>| {
+                let c = from + off;
+                estimator.moved(&pose(c.x, c.y, c.z), &increment, &around)
+            };
+            let by_pose = at(Vector3::zeros()).by_pose;
+            let h = 1e-2;
+            for k in 0..3 {
+                let step = Vector3::ith(k, h);
+                let slope = difference(&at(step).pose, &at(-step).pose) / (2.0 * h);
+                assert!((slope - by_pose.column(k)).norm() < 1e-3, "{k}: {slope} {by_pose}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_motion_that_is_no_number_leaves_the_robot_unsure_where_it_was() {
+        for config in [SlamConfig::default(), SlamConfig::paper()] {
+            let mut robot = Robot::new(config);
+            assert!(robot.go(0.3, 0.0, 0.1));
+            let before = robot.estimator.pose();
+            assert!(!robot.go(f32::NAN, 0.0, 0.0));
+            assert_eq!(components(&robot.estimator.pose()), components(&before));
+            assert_eq!(robot.estimator.local().covariance, Matrix3::identity());
+            let covariance = robot.estimator.covariance(&config.line_noise);
+            assert!(covariance.m11 >= 1.0 && covariance.m33 >= 0.25, "{covariance}");
+            assert!(robot.go(0.1, 0.0, 0.0));
+        }
+    }
+
+    #[test]
+    fn pose_and_lines_move_at_once_and_only_once() {
+        let mut robot = Robot::new(SlamConfig::default());
+        assert_eq!(robot.see(&[wall()]).new, 1);
+        let at_first = robot.map.segments()[0].segment;
+        // Two decimetres by the odometry, and a centimetre more by the wall.
+        assert!(robot.go(0.1, 0.0, 0.0) && robot.go(0.1, 0.0, 0.0));
+        robot.tracker.pairs.push(crate::tracking::association::Pair { observed: 0, mapped: 0 }).unwrap();
+        let seen = wall().transformed(&pose(-0.21, 0.0, 0.0));
+        assert_eq!(robot.see(&[seen]).matched, 1);
+        assert_eq!(robot.map.segments()[0].segment.midpoint(), at_first.midpoint(), "not yet");
+        let before = robot.estimator.pose();
+        let (estimator, mut around) = robot.with(&[]);
+        estimator.commit(&mut around);
+        let after = robot.estimator.pose();
+        let gone_on = (before.inverse() * after).translation.vector.x;
+        let pushed = (robot.map.segments()[0].segment.midpoint() - at_first.midpoint()).x;
+        assert!(gone_on > 0.0 && pushed < 0.0, "both give way: {gone_on} {pushed}");
+        let (estimator, mut around) = robot.with(&[]);
+        estimator.commit(&mut around);
+        assert_eq!(components(&robot.estimator.pose()), components(&after));
+    }
+
+    #[test]
+    fn size_is_what_the_documentation_says() {
+        assert!(core::mem::size_of::<Estimator>() <= 24 * 1024, "{}", core::mem::size_of::<Estimator>());
+    }
+}

@@ -1,0 +1,6 @@
+//! Poses, lines and how far two lines are apart.
+
+pub mod math;
+pub mod pose;
+pub mod residual;
+pub mod segment;

@@ -1,0 +1,3 @@
+//! The scanner: its beams, its noise, what its ranges mean.
+
+pub mod scan;

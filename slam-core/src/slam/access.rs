@@ -1,0 +1,131 @@
+//! Making a [`Slam`], and asking it: nothing here moves pose or map.
+
+use core::mem::MaybeUninit;
+
+use nalgebra::{Isometry2, Matrix3};
+
+use super::Slam;
+use crate::config::{ConfigError, SlamConfig};
+use crate::estimator::Estimator;
+use crate::frontend::Frontend;
+use crate::frontend::deskew::ScanPoint;
+use crate::geometry::segment::Segment;
+use crate::loop_closure::LoopCloser;
+use crate::map::SegmentMap;
+use crate::odometry::bias::OdometryBias;
+use crate::odometry::health::OdometryHealth;
+use crate::odometry::wheel_faults::WheelFault;
+use crate::sensor::scan::SensorConfig;
+use crate::tracking::state::StateMonitor;
+use crate::tracking::{Tracker, TrackingState};
+use crate::update::Counters;
+
+impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
+    /// Size in RAM.
+    pub const BYTES: usize = core::mem::size_of::<Self>();
+
+    /// An empty map, with the robot at its origin.
+    pub fn new(config: SlamConfig) -> Result<Self, ConfigError> {
+        Self::check(&config)?;
+        let mut slam = Self::blank(config);
+        slam.prepare();
+        Ok(slam)
+    }
+
+    /// The same, made where it is to stay: no copy of it passes over the stack.
+    pub fn new_in(place: &mut MaybeUninit<Self>, config: SlamConfig) -> Result<&mut Self, ConfigError> {
+        Self::check(&config)?;
+        let slam = place.write(Self::blank(config));
+        slam.prepare();
+        Ok(slam)
+    }
+
+    /// Takes another scanner, or the same one whose beams lie otherwise from now on, as scanners that do not turn evenly need it
+    /// before each scan. Map and pose stay.
+    pub fn set_sensor(&mut self, sensor: SensorConfig) -> Result<(), ConfigError> {
+        let config = SlamConfig { sensor, ..self.config };
+        Self::check(&config)?;
+        self.config = config;
+        Ok(())
+    }
+
+    pub(crate) fn check(config: &SlamConfig) -> Result<(), ConfigError> {
+        config.validate()?;
+        let beams = config.sensor.geometry.beams();
+        if beams > BEAMS {
+            return Err(ConfigError::TooManyBeams { beams, capacity: BEAMS });
+        }
+        Ok(())
+    }
+
+    /// Before [`Self::prepare`]. Inlined, so that it is built in its place.
+    #[inline(always)]
+    pub(crate) fn blank(config: SlamConfig) -> Self {
+        Self {
+            config,
+            map: SegmentMap::new(),
+            estimator: Estimator::blank(),
+            frontend: Frontend::new(),
+            tracker: Tracker::new(),
+            loops: LoopCloser::default(),
+            odometry: OdometryHealth::new(config.line_noise, config.odometry.noise),
+            state: StateMonitor::default(),
+            counters: Counters::default(),
+        }
+    }
+
+    /// What depends on the configuration.
+    pub(crate) fn prepare(&mut self) {
+        self.estimator.prepare(&self.config);
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &SlamConfig {
+        &self.config
+    }
+
+    /// The map.
+    pub fn map(&self) -> &SegmentMap<N> {
+        &self.map
+    }
+
+    /// Pose of `base` in `map` at the last scan.
+    pub fn pose(&self) -> Isometry2<f32> {
+        self.estimator.pose()
+    }
+
+    /// Covariance of the pose (x, y, θ), in `map`.
+    pub fn covariance(&self) -> Matrix3<f32> {
+        self.estimator.covariance(&self.config.line_noise)
+    }
+
+    /// Systematic errors of the odometry as learnt so far.
+    pub fn odometry_bias(&self) -> OdometryBias {
+        self.estimator.odometry_bias()
+    }
+
+    /// How far the pose is to be relied on.
+    pub fn state(&self) -> TrackingState {
+        self.state.state()
+    }
+
+    /// What is wrong with the wheels, where that is known.
+    pub fn wheel_fault(&self) -> Option<WheelFault> {
+        self.odometry.wheel_fault()
+    }
+
+    /// Counters since the start.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Points of the last scan that were placed, in `base` at its middle beam.
+    pub fn points(&self) -> &[ScanPoint] {
+        self.frontend.points()
+    }
+
+    /// Segments seen in the last scan, in `base` at its middle beam.
+    pub fn observed(&self) -> &[Segment] {
+        self.frontend.segments()
+    }
+}
