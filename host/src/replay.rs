@@ -6,13 +6,13 @@ use nalgebra::Isometry2;
 use slam_core::config::ConfigError;
 use slam_core::geometry::pose::pose;
 use slam_core::map::{MapCounters, MapSegment};
-use slam_core::odometry::{Increment, OdometryNoise};
-use slam_core::sensor::scan::{ScanGeometry, SensorConfig};
+use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
+use slam_core::sensor::scan::SensorConfig;
 use slam_core::slam::Counters;
-use slam_core::{OdometryTrack, Scan, ScanMotion, Slam, SlamConfig, SlamUpdate};
+use slam_core::{Mapper, ScanMotion, Slam, SlamConfig, SlamUpdate, WheelTicks};
 
-use crate::log::{LEAST_JUMP_M, Log, MOST_SPEED, Odometry};
-use crate::robot::Robot;
+use crate::log::{Log, Odometry};
+use crate::robot::{Robot, Wheels};
 
 /// Map segments of the replayed `Slam`: what the firmware has.
 pub const MAP_SEGMENTS: usize = 512;
@@ -24,10 +24,8 @@ const MANY_BEAMS: usize = 2048;
 pub(crate) const MOST_BEAMS: usize = 8192;
 /// Odometry samples held, which must span the sweep of a scan.
 const TRACK: usize = 256;
-/// Where there is no odometry the robot may move this fast, m/s and rad/s, …
-const UNKNOWN_SPEED: [f32; 2] = [0.5, 1.0];
-/// … which makes the pose this unsure: between scans 0.1 s apart by a decimetre and six degrees. Chosen on one log, of a scanner
-/// carried by hand (ccny_demo).
+/// Where there is no odometry a robot of [unknown speed](slam_core::mapper::UNKNOWN_SPEED) makes the pose this unsure: between scans
+/// 0.1 s apart by a decimetre and six degrees. Chosen on one log, of a scanner carried by hand (ccny_demo).
 const UNKNOWN_MOTION: OdometryNoise = OdometryNoise {
     sigma_along_m_per_sqrt_m: 0.3,
     sigma_across_m_per_sqrt_m: 0.3,
@@ -143,21 +141,24 @@ fn run_sized<const BEAMS: usize>(
     mut progress: impl FnMut(),
 ) -> Result<Replay, ReplayError> {
     let refused = |source| ReplayError::Config { robot: robot.name.clone(), source };
-    let mut slam = Slam::<MAP_SEGMENTS, BEAMS>::new(config).map_err(refused)?;
-    let mut feed = OdometryFeed::new(log, robot, &config)?;
+    let wheels = robot.wheels.zip(robot.drive());
+    let drive = wheels.map(|(wheels, drive)| drive_of_counters(&wheels, drive));
+    let mut mapper = Mapper::<MAP_SEGMENTS, TRACK, BEAMS>::new(config, drive).map_err(refused)?;
+    let mut feed = OdometryFeed::new(log, robot)?;
     let delay_us = (robot.sensor.scan_delay_s * 1e6).round() as i64;
     let mut steps: Vec<Step> = Vec::with_capacity(log.scans.len());
     let mut odometry = Isometry2::identity();
     let mut distance_m = 0.0;
     for (k, scan) in log.scans.iter().enumerate() {
         let sensor = robot.sensor_for(&log.layout(k));
-        if sensor != slam.config().sensor {
-            slam.set_sensor(sensor).map_err(refused)?;
+        if sensor != mapper.slam().config().sensor {
+            mapper.set_sensor(sensor).map_err(refused)?;
         }
         let middle_us = (scan.stamp_us + STAMP_OFFSET_US).saturating_add_signed(-delay_us);
-        let motion = feed.motion(middle_us, &sensor.geometry);
+        feed.advance(&mut mapper, middle_us + sensor.geometry.sweep_us() / 2);
+        let motion = mapper.motion(middle_us).unwrap_or_else(|| mapper.unknown_motion(middle_us));
         let started = Instant::now();
-        let update = slam.process_scan(&Scan { ranges_mm: &scan.ranges_mm }, &motion);
+        let update = mapper.scan_with(middle_us, &scan.ranges_mm, &motion);
         let took = started.elapsed();
         odometry *= motion.since_previous.before_from_after;
         if let Some(closure) = &update.closure {
@@ -184,6 +185,7 @@ fn run_sized<const BEAMS: usize>(
         });
         progress();
     }
+    let slam = mapper.slam();
     Ok(Replay {
         steps,
         map: slam.map().segments().to_vec(),
@@ -192,129 +194,80 @@ fn run_sized<const BEAMS: usize>(
         slam_bytes: Slam::<MAP_SEGMENTS, BEAMS>::BYTES,
         config,
         distance_m,
-        impossible_steps: feed.impossible_steps,
+        impossible_steps: mapper.counters().impossible_steps as usize,
         restarts_us: feed.restarts_us,
         robot: robot.clone(),
     })
 }
 
-/// Hands the log's odometry to the core's track, no further than needed, and tells the motion of each scan.
+/// The drive for counters handed over as [`counters`] does.
+fn drive_of_counters(wheels: &Wheels, drive: DifferentialDrive) -> DifferentialDrive {
+    let ticks_per_turn = drive.ticks_per_turn * 2.0f32.powi(unused_bits(wheels) as i32);
+    DifferentialDrive { ticks_per_turn, ..drive }
+}
+
+/// Counters in the upper bits of 32, so that they wrap where the robot's do.
+fn counters(wheels: &Wheels, ticks: [i64; 2]) -> [i32; 2] {
+    ticks.map(|ticks| (ticks as i32) << unused_bits(wheels))
+}
+
+fn unused_bits(wheels: &Wheels) -> u32 {
+    32 - u32::from(wheels.counter_bits)
+}
+
+/// Hands the log's odometry to the core, no further than needed.
 struct OdometryFeed<'a> {
     rest: std::slice::Iter<'a, (u64, Odometry)>,
     last: Option<(u64, Odometry)>,
-    robot: &'a Robot,
-    config: &'a SlamConfig,
-    track: OdometryTrack<TRACK>,
-    /// Where the motion of the next scan begins: at the scan before, …
-    from_us: Option<u64>,
-    /// … but for what was taken out of the track before it could be overwritten.
-    carried: Option<Increment>,
-    /// Samples fed since then.
-    since: usize,
-    impossible_steps: usize,
+    wheels: Option<(Wheels, DifferentialDrive)>,
     restarts_us: Vec<u64>,
 }
 
 impl<'a> OdometryFeed<'a> {
-    fn new(log: &'a Log, robot: &'a Robot, config: &'a SlamConfig) -> Result<Self, ReplayError> {
+    fn new(log: &'a Log, robot: &Robot) -> Result<Self, ReplayError> {
         let counts_wheels = log.odometry.iter().any(|(_, o)| !matches!(o, Odometry::Pose(_)));
-        if counts_wheels && robot.wheels.is_none() {
+        let wheels = robot.wheels.zip(robot.drive());
+        if counts_wheels && wheels.is_none() {
             return Err(ReplayError::NoWheels { robot: robot.name.clone() });
         }
-        let track = OdometryTrack::default();
-        Ok(Self {
-            rest: log.odometry.iter(),
-            last: None,
-            robot,
-            config,
-            track,
-            from_us: None,
-            carried: None,
-            since: 0,
-            impossible_steps: 0,
-            restarts_us: Vec::new(),
-        })
+        Ok(Self { rest: log.odometry.iter(), last: None, wheels, restarts_us: Vec::new() })
     }
 
-    /// The motion for a scan whose middle beam was taken at `middle_us`. Without any odometry all that is known is how far the
-    /// robot may have moved.
-    fn motion(&mut self, middle_us: u64, geometry: &ScanGeometry) -> ScanMotion {
-        let half_sweep_us = geometry.sweep_us() / 2;
-        self.advance(middle_us + half_sweep_us, middle_us.saturating_sub(half_sweep_us));
-        let Some(mut motion) = self.track.scan_motion(self.from_us, middle_us, geometry) else {
-            let since_us =
-                self.from_us.replace(middle_us).map_or(0, |from_us| middle_us.saturating_sub(from_us));
-            let [distance_m, turn_rad] = UNKNOWN_SPEED.map(|speed| speed * since_us as f32 * 1e-6);
-            return ScanMotion::instantaneous(Increment { distance_m, turn_rad, ..Increment::identity() });
-        };
-        if let Some(carried) = self.carried.take() {
-            motion.since_previous = carried.then(&motion.since_previous);
-        }
-        (self.from_us, self.since) = (Some(middle_us), 0);
-        motion
-    }
-
-    /// Feeds samples until one lies at or after `until_us`. The poses from `sweep_us` on stay in the track.
-    fn advance(&mut self, until_us: u64, sweep_us: u64) {
-        while self.last.is_none_or(|(fed_us, _)| fed_us < until_us)
-            && let Some((stamp_us, odometry)) = self.rest.next()
+    /// Feeds samples until one lies at or after `until_us`.
+    fn advance<const BEAMS: usize>(
+        &mut self,
+        mapper: &mut Mapper<MAP_SEGMENTS, TRACK, BEAMS>,
+        until_us: u64,
+    ) {
+        while self.last.is_none_or(|(logged_us, _)| logged_us + STAMP_OFFSET_US < until_us)
+            && let Some((logged_us, odometry)) = self.rest.next()
         {
-            let stamp_us = stamp_us + STAMP_OFFSET_US;
-            let step =
-                self.last.map_or(Increment::identity(), |last| self.increment(last, (stamp_us, *odometry)));
-            self.last = Some((stamp_us, *odometry));
-            // The log's odometry is sorted and without equal stamps.
-            let pushed = self.track.push(stamp_us, step);
-            debug_assert!(pushed.is_ok());
-            self.since += 1;
-            // Before the track forgets where the motion begins.
-            if self.since >= TRACK / 2
-                && let Some(from_us) =
-                    self.from_us.filter(|from_us| (*from_us..=sweep_us).contains(&stamp_us))
-                && let Some(motion) = self.track.between(from_us, stamp_us)
-            {
-                self.carried = Some(self.carried.map_or(motion, |carried| carried.then(&motion)));
-                (self.from_us, self.since) = (Some(stamp_us), 0);
+            let stamp_us = logged_us + STAMP_OFFSET_US;
+            let restarted = mapper.counters().counters_restarted;
+            match (odometry, self.wheels) {
+                (Odometry::Ticks(ticks), Some((wheels, _))) => {
+                    let [left, right] = counters(&wheels, *ticks);
+                    mapper.push(WheelTicks { stamp_us, left, right });
+                }
+                _ => mapper.push_motion(stamp_us, self.motion_to(odometry, mapper.slam().config())),
             }
+            if mapper.counters().counters_restarted != restarted {
+                self.restarts_us.push(*logged_us);
+            }
+            self.last = Some((*logged_us, *odometry));
         }
     }
 
-    fn increment(&mut self, before: (u64, Odometry), after: (u64, Odometry)) -> Increment {
-        let step = self.step(before.1, after.1);
-        if let (Odometry::Ticks(from), Odometry::Ticks(to), Some((wheels, drive))) =
-            (before.1, after.1, self.robot.wheels.zip(self.robot.drive()))
-        {
-            let possible = |ticks: [i32; 2]| drive.is_possible(ticks[0], ticks[1], after.0 - before.0);
-            if possible(wheels.ticks_between(from, to)) {
-                return step;
-            }
-            if possible(wheels.ticks_between([0, 0], to)) {
-                self.restarts_us.push(after.0 - STAMP_OFFSET_US);
-            }
-            self.impossible_steps += 1;
-            return Increment::identity();
-        }
-        let most_m = LEAST_JUMP_M + MOST_SPEED * (after.0 - before.0) as f64 * 1e-6;
-        if f64::from(step.distance_m) <= most_m {
-            return step;
-        }
-        self.impossible_steps += 1;
-        Increment::identity()
-    }
-
-    fn step(&self, before: Odometry, after: Odometry) -> Increment {
-        let integration = self.config.odometry.integration;
-        match (before, after, self.robot.wheels.zip(self.robot.drive())) {
-            (Odometry::Ticks(before), Odometry::Ticks(after), Some((wheels, drive))) => {
-                let [left, right] = wheels.ticks_between(before, after);
-                drive.increment(left, right, integration)
-            }
-            (Odometry::Angles(before), Odometry::Angles(after), Some((wheels, drive))) => {
+    /// The motion since the last sample, by what does not count ticks.
+    fn motion_to(&self, odometry: &Odometry, config: &SlamConfig) -> Increment {
+        let last = self.last.map(|(_, odometry)| odometry);
+        match (last, odometry, self.wheels) {
+            (Some(Odometry::Angles(before)), Odometry::Angles(after), Some((wheels, drive))) => {
                 let ticks_per_rad = f64::from(wheels.ticks_per_turn) / (2.0 * std::f64::consts::PI);
                 let [left, right] = [0, 1].map(|side| ((after[side] - before[side]) * ticks_per_rad) as f32);
-                drive.increment_of_parts(left, right, integration)
+                drive.increment_of_parts(left, right, config.odometry.integration)
             }
-            (Odometry::Pose(before), Odometry::Pose(after), _) => {
+            (Some(Odometry::Pose(before)), Odometry::Pose(after), _) => {
                 let (s, c) = before[2].sin_cos();
                 let (dx, dy) = (after[0] - before[0], after[1] - before[1]);
                 let turn = after[2] - before[2];

@@ -32,36 +32,31 @@
 //! Times are those of the middle beam of a scan.
 //!
 //! # Reading order
-//! [`mapper`] for what a firmware holds, [`slam`] for the whole, [`geometry::segment`] for what a line is, [`sensor`] and [`odometry`]
+//! [`mapper`] for the one door, [`slam`] for the whole, [`geometry::segment`] for what a line is, [`sensor`] and [`odometry`]
 //! for what comes in, then the stages in the order of the drawing: [`frontend`], [`tracking`], [`ekf`] and [`map`], and [`paper`] for
 //! the paper's own. [`config`] has every constant and where it comes from.
 //!
 //! # Example
 //! ```
-//! use slam_core::odometry::{DifferentialDrive, Integration, ticks_between_u16};
-//! use slam_core::{OdometryTrack, Scan, Slam, SlamConfig};
+//! use slam_core::odometry::DifferentialDrive;
+//! use slam_core::{Mapper, SlamConfig, WheelTicks};
 //!
 //! let config = SlamConfig::default(); // a URG-04LX, 0.140 m ahead of the axle
-//! let mut slam = Slam::<128>::new(config)?;
-//! let mut track = OdometryTrack::<32>::default();
 //! let drive = DifferentialDrive {
 //!     left_wheel_radius_m: 0.05,
 //!     right_wheel_radius_m: 0.05,
 //!     track_m: 0.3,
 //!     ticks_per_turn: 2000.0,
 //! };
+//! let mut mapper = Mapper::<128, 32>::new(config, drive)?;
 //!
 //! // As often as the encoders are sampled:
-//! let mut before = [65_530u16, 0];
-//! for (stamp_us, now) in [(0, before), (50_000, [4, 11]), (100_000, [14, 22])] {
-//!     let ticks = [0, 1].map(|wheel| ticks_between_u16(before[wheel], now[wheel]));
-//!     track.push(stamp_us, drive.increment(ticks[0], ticks[1], Integration::Arc)).expect("stamps increase");
-//!     before = now;
+//! for (stamp_us, left, right) in [(0, 0, 0), (50_000, 4, 11), (100_000, 14, 22)] {
+//!     mapper.push(WheelTicks { stamp_us, left, right });
 //! }
-//! // As often as the sensor delivers a scan, whose middle beam was taken at 60 ms; there was none before:
-//! let motion = track.scan_motion(None, 60_000, &config.sensor.geometry).expect("the track has samples");
+//! // As often as the sensor delivers a scan, whose middle beam was taken at 60 ms:
 //! let ranges_mm = [2000u16; 682];
-//! let update = slam.process_scan(&Scan { ranges_mm: &ranges_mm }, &motion);
+//! let update = mapper.scan(60_000, &ranges_mm).expect("there is odometry for it");
 //! assert_eq!(update.rejected, None);
 //! # Ok::<(), slam_core::ConfigError>(())
 //! ```

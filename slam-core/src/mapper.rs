@@ -1,20 +1,23 @@
-//! The whole robot as a firmware holds it: wheel ticks and scans go in with their stamps, the pose comes out.
+//! The one door: odometry and scans go in with their stamps, the pose comes out.
 //!
-//! [`Slam`] wants the motion of each scan; this keeps the odometry that tells it, moves on by odometry alone when scans
-//! stay away, and takes up its map again after a reset. It is what runs on the microcontroller, so that a PC given the
-//! same ticks and scans in the same order computes the same bits.
+//! [`Slam`] wants the motion of each scan; this keeps the odometry that tells it, leaves out what no robot can have done, moves on
+//! by odometry alone when scans stay away, and takes up its map again after a reset. It is what runs on the microcontroller
+//! and what replays logs on a PC: given the same samples and scans in the same order both compute the same bits.
 
 use core::mem::MaybeUninit;
 
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::{ConfigError, SlamConfig};
-use crate::odometry::track::OdometryTrack;
+use crate::odometry::track::{OdometryTrack, ScanMotion};
 use crate::odometry::{DifferentialDrive, Increment};
-use crate::sensor::scan::Scan;
+use crate::sensor::scan::{Scan, SensorConfig};
 use crate::slam::{Slam, SlamUpdate};
 
 /// Wheel ticks at an instant.
+///
+/// Counters of fewer than 32 bits go in the upper bits, with as many times more ticks for a turn in the [`DifferentialDrive`], so
+/// that they wrap where they should.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct WheelTicks {
@@ -31,6 +34,9 @@ pub struct WheelTicks {
 pub const UNSEEN: [f32; 3] = [0.02, 0.02, 0.02];
 /// The same where the reset came in the middle of a scan, and what the pose had in common with the walls is lost.
 pub const UNSEEN_IN_WORK: [f32; 3] = [0.05, 0.05, 0.05];
+/// Where there is no odometry the robot may move this fast, m/s and rad/s. Chosen on one log, of a scanner carried by hand
+/// (ccny_demo).
+pub const UNKNOWN_SPEED: [f32; 2] = [0.5, 1.0];
 
 /// How long a reset may take, microseconds: the wait of a watchdog and the boot, with room to spare. The wheels may go on turning.
 const RESET_US: u64 = 10_000_000;
@@ -39,42 +45,46 @@ const RESET_US: u64 = 10_000_000;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct MapperCounters {
-    /// Samples whose stamp did not increase; they were passed over, their ticks come with the next.
+    /// Samples whose stamp did not increase; they were passed over. Ticks come with the next sample, a motion is lost.
     pub stamps_refused: u32,
     /// Scans for which there was no odometry yet, or that are older than the last; they were passed over.
     pub scans_without_odometry: u32,
     /// Times that the robot took up its map again after a reset.
     pub resumed: u32,
-    /// Samples between which the wheels cannot have turned so far; their ticks were left out.
+    /// Samples between which no robot can have moved so far; they count as none.
     pub impossible_steps: u32,
     /// Those of them after which both counters stood near zero: they had been restarted.
     pub counters_restarted: u32,
 }
 
-/// Ticks and scans in, poses out. Room for `N` map segments and `K` odometry samples, which must span a scan and its
-/// way to here: 64 at 200 Hz are 0.32 s.
+/// Odometry and scans in, poses out. Room for `N` map segments, `BEAMS` beams and `K` odometry samples, which must span a scan
+/// and its way to here: 64 at 200 Hz are 0.32 s. Longer gaps between scans are bridged.
+///
+/// The map's origin is where the robot was at the first scan, or at the first sample if it coasts before.
 ///
 /// RAM: [`Mapper::BYTES`], that of [`Slam`] and 48 bytes for each sample.
-pub struct Mapper<const N: usize, const K: usize> {
-    slam: Slam<N>,
-    drive: DifferentialDrive,
+pub struct Mapper<const N: usize, const K: usize, const BEAMS: usize = 682> {
+    slam: Slam<N, BEAMS>,
+    drive: Option<DifferentialDrive>,
     track: OdometryTrack<K>,
     last_ticks: Option<WheelTicks>,
     /// The instant of the pose.
     pose_us: Option<u64>,
+    /// The motion since then up to an instant before which the track may have forgotten it.
+    carried: Option<(u64, Increment)>,
     /// Set while the time of the next sample has nothing to do with that of the last.
     resuming: Option<[f32; 3]>,
     counters: MapperCounters,
 }
 
-impl<const N: usize, const K: usize> Mapper<N, K> {
+impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
     /// Size in RAM.
     pub const BYTES: usize = core::mem::size_of::<Self>();
 
-    /// An empty map.
-    pub fn new(config: SlamConfig, drive: DifferentialDrive) -> Result<Self, ConfigError> {
-        Slam::<N>::check(&config)?;
-        let mut mapper = Self::blank(config, drive);
+    /// An empty map. Without a drive there is no use in ticks, only in motions.
+    pub fn new(config: SlamConfig, drive: impl Into<Option<DifferentialDrive>>) -> Result<Self, ConfigError> {
+        Slam::<N, BEAMS>::check(&config)?;
+        let mut mapper = Self::blank(config, drive.into());
         mapper.slam.prepare();
         Ok(mapper)
     }
@@ -83,30 +93,36 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
     pub fn new_in(
         place: &mut MaybeUninit<Self>,
         config: SlamConfig,
-        drive: DifferentialDrive,
+        drive: impl Into<Option<DifferentialDrive>>,
     ) -> Result<&mut Self, ConfigError> {
-        Slam::<N>::check(&config)?;
-        let mapper = place.write(Self::blank(config, drive));
+        Slam::<N, BEAMS>::check(&config)?;
+        let mapper = place.write(Self::blank(config, drive.into()));
         mapper.slam.prepare();
         Ok(mapper)
     }
 
     #[inline(always)]
-    fn blank(mut config: SlamConfig, drive: DifferentialDrive) -> Self {
-        config.odometry.track_m.get_or_insert(drive.track_m);
+    fn blank(mut config: SlamConfig, drive: Option<DifferentialDrive>) -> Self {
+        config.odometry.track_m = config.odometry.track_m.or(drive.map(|drive| drive.track_m));
         Self {
             slam: Slam::blank(config),
             drive,
             track: OdometryTrack::default(),
             last_ticks: None,
             pose_us: None,
+            carried: None,
             resuming: None,
             counters: MapperCounters::default(),
         }
     }
 
+    /// Takes another scanner, see [`Slam::set_sensor`].
+    pub fn set_sensor(&mut self, sensor: SensorConfig) -> Result<(), ConfigError> {
+        self.slam.set_sensor(sensor)
+    }
+
     /// Map, pose and counters.
-    pub fn slam(&self) -> &Slam<N> {
+    pub fn slam(&self) -> &Slam<N, BEAMS> {
         &self.slam
     }
 
@@ -115,78 +131,138 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
         self.counters
     }
 
-    /// The instant of the pose, microseconds; `None` before the first sample.
+    /// The instant of the pose, microseconds: that of the last scan, or where coasting ended. `None` before both.
     pub fn pose_us(&self) -> Option<u64> {
         self.pose_us
     }
 
-    /// Ticks and stamp of the newest sample.
+    /// Ticks and stamp of the newest sample of ticks, unless a motion came after it.
     pub fn last_ticks(&self) -> Option<WheelTicks> {
         self.last_ticks
     }
 
-    /// Takes a sample of the wheels.
+    /// Takes a sample of the wheels' counters. The first says only where they begin.
     pub fn push(&mut self, ticks: WheelTicks) {
         let step = self.step_to(&ticks);
+        if self.take_step(ticks.stamp_us, step) {
+            self.last_ticks = Some(ticks);
+        }
+    }
+
+    /// Takes a sample of odometry that does not count ticks: the motion since the sample before, in `base` then. What the first
+    /// says of the motion before it is not used.
+    pub fn push_motion(&mut self, stamp_us: u64, motion: Increment) {
+        let since_us = self.track.newest_us().map_or(0, |last_us| stamp_us.saturating_sub(last_us));
+        let possible = motion.is_possible(since_us);
+        let step = if possible { motion } else { self.impossible_step() };
+        if self.take_step(stamp_us, step) {
+            self.last_ticks = None;
+        }
+    }
+
+    /// What the wheels did since the last sample.
+    fn step_to(&mut self, ticks: &WheelTicks) -> Increment {
+        let integration = self.slam.config().odometry.integration;
+        let (Some(drive), Some(last)) = (&self.drive, self.last_ticks) else { return Increment::identity() };
+        let (left, right) = (ticks.left.wrapping_sub(last.left), ticks.right.wrapping_sub(last.right));
+        // Across a reset time is not known.
+        let since_us =
+            if self.resuming.is_some() { RESET_US } else { ticks.stamp_us.saturating_sub(last.stamp_us) };
+        if drive.is_possible(left, right, since_us) {
+            return drive.increment(left, right, integration);
+        }
+        if drive.is_possible(ticks.left, ticks.right, since_us) {
+            self.counters.counters_restarted = self.counters.counters_restarted.saturating_add(1);
+        }
+        self.impossible_step()
+    }
+
+    /// Counts it; it is taken as none.
+    fn impossible_step(&mut self) -> Increment {
+        self.counters.impossible_steps = self.counters.impossible_steps.saturating_add(1);
+        Increment::identity()
+    }
+
+    /// Appends a step that is believed. False where its stamp does not increase.
+    fn take_step(&mut self, stamp_us: u64, step: Increment) -> bool {
         if let Some(unseen) = self.resuming.take() {
             // Across the reset: what the wheels counted, and what they may have done unseen.
             self.slam.coast(&step);
             let sigmas = Vector3::from(unseen);
             self.slam.loosen(&Matrix3::from_diagonal(&sigmas.component_mul(&sigmas)));
             self.track = OdometryTrack::default();
-            self.pose_us = None;
+            (self.pose_us, self.carried) = (Some(stamp_us), None);
         }
-        if self.track.push(ticks.stamp_us, step).is_err() {
-            self.counters.stamps_refused = self.counters.stamps_refused.saturating_add(1);
-            return;
-        }
-        self.last_ticks = Some(ticks);
-        self.pose_us.get_or_insert(ticks.stamp_us);
+        self.carry();
+        let taken = self.track.push(stamp_us, step).is_ok();
+        self.counters.stamps_refused = self.counters.stamps_refused.saturating_add(u32::from(!taken));
+        taken
     }
 
-    /// What the wheels did since the last sample.
-    fn step_to(&mut self, ticks: &WheelTicks) -> Increment {
-        let integration = self.slam.config().odometry.integration;
-        let Some(last) = self.last_ticks else { return self.drive.increment(0, 0, integration) };
-        let (left, right) = (ticks.left.wrapping_sub(last.left), ticks.right.wrapping_sub(last.right));
-        let step = self.drive.increment(left, right, integration);
-        // Across a reset time is not known.
-        let since_us =
-            if self.resuming.is_some() { RESET_US } else { ticks.stamp_us.saturating_sub(last.stamp_us) };
-        if self.drive.is_possible(left, right, since_us) {
-            return step;
+    /// Before the track forgets where the motion since the pose begins, its older part is taken out.
+    fn carry(&mut self) {
+        let Some(from_us) = self.motion_from_us() else { return };
+        let Some(until_us) = self.track.until_before_forgetting(from_us) else { return };
+        if let Some(motion) = self.track.between(from_us, until_us) {
+            self.carried = Some((until_us, self.with_carried(motion)));
         }
-        self.counters.impossible_steps = self.counters.impossible_steps.saturating_add(1);
-        if self.drive.is_possible(ticks.left, ticks.right, since_us) {
-            self.counters.counters_restarted = self.counters.counters_restarted.saturating_add(1);
-        }
-        self.drive.increment(0, 0, integration)
     }
 
-    /// Takes a scan whose middle beam was taken at `middle_us`. `None` without odometry for it.
+    /// Where in the track the motion since the pose goes on.
+    fn motion_from_us(&self) -> Option<u64> {
+        self.carried.map(|(until_us, _)| until_us).or(self.pose_us)
+    }
+
+    fn with_carried(&self, motion: Increment) -> Increment {
+        self.carried.map_or(motion, |(_, carried)| carried.then(&motion))
+    }
+
+    /// How the base moved, by odometry, to a scan whose middle beam was taken at `middle_us`. `None` without odometry, and for a
+    /// scan from before the pose. Work: at most 3·`K` steps and [`SWEEP_KNOTS`](crate::odometry::track::SWEEP_KNOTS).
+    pub fn motion(&self, middle_us: u64) -> Option<ScanMotion> {
+        if self.pose_us.is_some_and(|pose_us| pose_us > middle_us) {
+            return None;
+        }
+        let geometry = &self.slam.config().sensor.geometry;
+        let mut motion = self.track.scan_motion(self.motion_from_us(), middle_us, geometry)?;
+        motion.since_previous = self.with_carried(motion.since_previous);
+        Some(motion)
+    }
+
+    /// The same where nothing is known but how far the robot may have moved, by [`UNKNOWN_SPEED`].
+    pub fn unknown_motion(&self, middle_us: u64) -> ScanMotion {
+        let since_us = self.pose_us.map_or(0, |pose_us| middle_us.saturating_sub(pose_us));
+        let [distance_m, turn_rad] = UNKNOWN_SPEED.map(|speed| speed * since_us as f32 * 1e-6);
+        ScanMotion::instantaneous(Increment { distance_m, turn_rad, ..Increment::identity() })
+    }
+
+    /// Takes a scan whose middle beam was taken at `middle_us`, with its [`Self::motion`]. `None` where there is none: the scan
+    /// is passed over.
     pub fn scan(&mut self, middle_us: u64, ranges_mm: &[u16]) -> Option<SlamUpdate> {
-        let geometry = self.slam.config().sensor.geometry;
-        let from_us = self.pose_us.filter(|from| *from <= middle_us);
-        let motion = from_us.and_then(|from| self.track.scan_motion(Some(from), middle_us, &geometry));
-        let Some(motion) = motion else {
+        let Some(motion) = self.motion(middle_us) else {
             self.counters.scans_without_odometry = self.counters.scans_without_odometry.saturating_add(1);
             return None;
         };
-        self.pose_us = Some(middle_us);
-        Some(self.slam.process_scan(&Scan { ranges_mm }, &motion))
+        Some(self.scan_with(middle_us, ranges_mm, &motion))
     }
 
-    /// Moves on by odometry alone to an instant, or the newest sample before it, where scans stay away. To be called often
-    /// enough that the track still holds the instant of the pose; a scan from before the new one is of no use any more. `None` if
-    /// there is nothing to move on to.
+    /// Takes a scan with a motion that was asked for before, or is [unknown](Self::unknown_motion).
+    pub fn scan_with(&mut self, middle_us: u64, ranges_mm: &[u16], motion: &ScanMotion) -> SlamUpdate {
+        (self.pose_us, self.carried) = (Some(middle_us), None);
+        self.slam.process_scan(&Scan { ranges_mm }, motion)
+    }
+
+    /// Moves on by odometry alone to an instant, or the newest sample before it, where scans stay away; a scan from before the
+    /// new instant is of no use any more. `None` if there is nothing to move on to.
     pub fn coast(&mut self, until_us: u64) -> Option<Isometry2<f32>> {
-        let (from_us, newest_us) = (self.pose_us?, self.track.span_us()?.1);
+        let (oldest_us, newest_us) = self.track.span_us()?;
+        let from_us = self.motion_from_us().unwrap_or(oldest_us);
         let to_us = newest_us.min(until_us);
         if to_us <= from_us {
             return None;
         }
-        let motion = self.track.between(from_us, to_us)?;
-        self.pose_us = Some(to_us);
+        let motion = self.with_carried(self.track.between(from_us, to_us)?);
+        (self.pose_us, self.carried) = (Some(to_us), None);
         Some(self.slam.coast(&motion))
     }
 
@@ -210,6 +286,7 @@ impl<const N: usize, const K: usize> Mapper<N, K> {
 mod tests {
     use super::*;
     use crate::geometry::pose::components;
+    use crate::odometry::Integration;
 
     const DRIVE: DifferentialDrive = DifferentialDrive {
         left_wheel_radius_m: 0.05,
@@ -330,14 +407,102 @@ mod tests {
         mapper.push(ticks(4));
         mapper.push(ticks(3));
         mapper.push(ticks(4));
+        assert!(mapper.scan(30_000, &[1000; 682]).is_some());
         // Older than the pose.
         assert!(mapper.scan(1_000, &[1000; 682]).is_none());
-        assert!(mapper.scan(30_000, &[1000; 682]).is_some());
         let expected =
             MapperCounters { stamps_refused: 2, scans_without_odometry: 2, ..MapperCounters::default() };
         assert_eq!(mapper.counters(), expected);
         // The ticks of a refused sample are not lost.
         mapper.push(ticks(5));
         assert_eq!(mapper.last_ticks(), Some(ticks(5)));
+    }
+
+    /// A curve, 10 samples to the scan.
+    fn curve(mapper: &mut Mapper<64, 64>, samples: core::ops::Range<u64>) -> Vector3<f32> {
+        for k in samples.clone() {
+            mapper.push(WheelTicks { stamp_us: 5_000 * k, left: 6 * k as i32, right: 10 * k as i32 });
+        }
+        let middle_us = 5_000 * (samples.end - 1);
+        let motion = mapper.motion(middle_us).unwrap();
+        mapper.scan(middle_us, &[0; 682]).unwrap();
+        components(&motion.since_previous.before_from_after)
+    }
+
+    #[test]
+    fn a_gap_between_scans_is_bridged_however_few_samples_the_track_holds() {
+        let mut mapper = mapper();
+        assert_eq!(curve(&mut mapper, 0..10), Vector3::zeros(), "the map begins at the first scan");
+        // The closed form of an arc of 1000 samples, in f64.
+        let moved = curve(&mut mapper, 10..1010);
+        let (way, turn) = (1000.0 * f64::from(STEP_M) * 0.8, 1000.0 * f64::from(STEP_M) * 0.4 / 0.3);
+        let (x, y) = (way / turn * turn.sin(), way / turn * (1.0 - turn.cos()));
+        let heading = turn.sin().atan2(turn.cos());
+        for (got, want) in moved.iter().zip([x, y, heading]) {
+            assert!((f64::from(*got) - want).abs() < 1e-3, "{moved} {x} {y} {heading}");
+        }
+        // And coasting takes it up too.
+        for k in 1010..1500 {
+            mapper.push(WheelTicks { stamp_us: 5_000 * k, left: 6 * k as i32, right: 10 * k as i32 });
+        }
+        let before = mapper.slam().pose();
+        mapper.coast(u64::MAX).unwrap();
+        let turned = components(&(before.inverse() * mapper.slam().pose())).z;
+        let turn = 490.0 * f64::from(STEP_M) * 0.4 / 0.3;
+        assert!((f64::from(turned) - turn.sin().atan2(turn.cos())).abs() < 1e-2, "{turned} {turn}");
+    }
+
+    #[test]
+    fn motions_and_ticks_say_the_same() {
+        let (mut by_ticks, mut by_motions) =
+            (mapper(), Mapper::<64, 64>::new(SlamConfig::default(), None).unwrap());
+        for scan in 0..5u64 {
+            for k in 20 * scan..20 * scan + 20 {
+                by_ticks.push(ticks(k));
+                let moved = if k == 0 { 0 } else { 10 };
+                by_motions.push_motion(5_000 * k, DRIVE.increment(moved, moved, Integration::Arc));
+            }
+            let middle_us = 100_000 * scan + 50_000;
+            let motions = [by_ticks.motion(middle_us), by_motions.motion(middle_us)];
+            assert_eq!(motions[0], motions[1]);
+            let poses =
+                [&mut by_ticks, &mut by_motions].map(|m| m.scan(middle_us, &[1500; 682]).unwrap().pose);
+            assert_eq!(poses[0], poses[1]);
+        }
+        by_motions.push_motion(500_000, Increment::from_motion(crate::geometry::pose::pose(3.0, 0.0, 0.0)));
+        assert_eq!(by_motions.counters().impossible_steps, 1);
+        // Ticks without wheels are no motion.
+        by_motions.push(ticks(110));
+        by_motions.push(ticks(120));
+        let before = by_motions.slam().pose();
+        assert!(by_motions.coast(600_000).is_some());
+        assert!((by_motions.slam().pose().translation.vector - before.translation.vector).norm() < 0.2);
+    }
+
+    #[test]
+    fn counters_of_sixteen_bits_wrap_in_the_upper_half() {
+        let drive = DifferentialDrive { ticks_per_turn: DRIVE.ticks_per_turn * 65_536.0, ..DRIVE };
+        let (mut wide, mut narrow) = (mapper(), Mapper::<64, 64>::new(SlamConfig::default(), drive).unwrap());
+        for k in 0..40u64 {
+            wide.push(ticks(k));
+            let at = (65_300 + 10 * k) as u16;
+            let upper = i32::from(at as i16) << 16;
+            narrow.push(WheelTicks { stamp_us: 5_000 * k, left: upper, right: upper });
+        }
+        assert_eq!(wide.motion(150_000), narrow.motion(150_000));
+        assert_eq!(narrow.counters().impossible_steps, 0);
+    }
+
+    #[test]
+    fn without_odometry_a_scan_may_have_come_from_as_far_as_a_robot_drives() {
+        let mut mapper = Mapper::<64, 64>::new(SlamConfig::default(), None).unwrap();
+        assert_eq!(mapper.motion(100_000), None);
+        for (middle_us, since_s) in [(100_000, 0.0), (300_000, 0.2)] {
+            let motion = mapper.unknown_motion(middle_us);
+            assert!((motion.since_previous.turn_rad - UNKNOWN_SPEED[1] * since_s).abs() < 1e-6);
+            assert!((motion.since_previous.distance_m - UNKNOWN_SPEED[0] * since_s).abs() < 1e-6);
+            mapper.scan_with(middle_us, &[1500; 682], &motion);
+        }
+        assert_eq!(mapper.slam().counters().scans, 2);
     }
 }

@@ -24,7 +24,6 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::Path;
 
-pub use assemble::{LEAST_JUMP_M, MOST_SPEED};
 pub use error::{Defect, LogError, Place, Warning};
 
 pub use plain::render as plain_text;

@@ -46,6 +46,11 @@ pub const MOST_SPEED_M_S: f32 = 5.0;
 /// … and ways shorter than this are believed whatever their stamps, which jitter, metres.
 pub const LEAST_JUMP_M: f32 = 0.5;
 
+/// Odometry of unknown origin may be that of a car, m/s, …
+pub const MOST_UNKNOWN_SPEED_M_S: f32 = 30.0;
+/// … and may correct itself by this at once, metres.
+pub const LEAST_UNKNOWN_JUMP_M: f32 = 1.0;
+
 /// Geometry of the two wheels and their encoders.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -131,6 +136,12 @@ impl Increment {
             distance_m: self.distance_m + next.distance_m,
             turn_rad: self.turn_rad + next.turn_rad,
         }
+    }
+
+    /// Whether a robot can move so far within a time: by [`MOST_UNKNOWN_SPEED_M_S`], and by [`LEAST_UNKNOWN_JUMP_M`] whatever the
+    /// time.
+    pub fn is_possible(&self, within_us: u64) -> bool {
+        self.distance_m <= LEAST_UNKNOWN_JUMP_M + MOST_UNKNOWN_SPEED_M_S * within_us as f32 * 1e-6
     }
 
     /// Whether every number is finite.

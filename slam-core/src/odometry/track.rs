@@ -100,6 +100,22 @@ impl<const K: usize> OdometryTrack<K> {
         Some((self.knots.oldest_ordered().next()?.stamp_us, self.knots.recent()?.stamp_us))
     }
 
+    /// Stamp of the newest sample, µs.
+    pub(crate) fn newest_us(&self) -> Option<u64> {
+        self.knots.recent().map(|knot| knot.stamp_us)
+    }
+
+    /// Where the next sample overwrites what tells the motion since an instant: a later one, an eighth of the samples on, up to which
+    /// that motion is to be taken out before. `None` as long as it is held.
+    pub(crate) fn until_before_forgetting(&self, from_us: u64) -> Option<u64> {
+        if self.knots.len() < K {
+            return None;
+        }
+        let mut knots = self.knots.oldest_ordered();
+        let next = knots.nth(1).filter(|next| next.stamp_us > from_us)?;
+        Some(knots.nth(K / 8).unwrap_or(next).stamp_us)
+    }
+
     /// Pose of the base in `odom` at an instant. Before the first and after the last sample: that sample's pose.
     ///
     /// `None` without samples. Work: at most `K` steps.

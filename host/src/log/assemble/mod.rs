@@ -15,7 +15,6 @@ use slam_core::config::MOST_OF_A_TURN;
 
 use super::records::{Records, ScanRecord};
 use super::{Defect, Format, Log, LogError, ReadOptions, Warning};
-pub use odometry::{LEAST_JUMP_M, MOST_SPEED};
 
 /// No scanner of a building sees this far half of the time, millimetres, …
 const MOST_MEDIAN_MM: f64 = 200e3;

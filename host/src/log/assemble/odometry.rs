@@ -2,6 +2,8 @@
 
 use std::collections::HashMap;
 
+use slam_core::odometry::{LEAST_UNKNOWN_JUMP_M, MOST_UNKNOWN_SPEED_M_S};
+
 use super::Assembly;
 use super::order::increasing;
 use super::stamps::{MADE_UP_US, Settled};
@@ -12,11 +14,6 @@ use crate::score::Spread;
 /// Poses of two sources that are farther apart than this, metres, are not of one odometry: on logs that were corrected afterwards
 /// (fhw, freiburg-101) the median is 0.04 m.
 const MOST_CONTRADICTION_M: f64 = 0.01;
-/// No robot is faster, m/s, …
-pub const MOST_SPEED: f64 = 30.0;
-/// … but its odometry may correct itself by this at once, metres.
-pub const LEAST_JUMP_M: f64 = 1.0;
-
 impl Assembly<'_> {
     /// Odometry with increasing stamps.
     pub(super) fn settle_odometry(&mut self, records: Vec<OdometryRecord>, settled: &Settled) {
@@ -126,7 +123,9 @@ impl Assembly<'_> {
             let (Odometry::Pose(from), Odometry::Pose(to)) = (a.1, b.1) else { return false };
             let step_m = (to[0] - from[0]).hypot(to[1] - from[1]);
             let finite = to.iter().all(|v| v.is_finite());
-            !finite || step_m > LEAST_JUMP_M + MOST_SPEED * (b.0 - a.0) as f64 * 1e-6
+            let within_s = (b.0 - a.0) as f64 * 1e-6;
+            let most_m = f64::from(LEAST_UNKNOWN_JUMP_M) + f64::from(MOST_UNKNOWN_SPEED_M_S) * within_s;
+            !finite || step_m > most_m
         };
         let mut kept: Vec<(u64, Odometry)> = Vec::with_capacity(readings.len());
         // What the poses are moved by: rotation and translation.
