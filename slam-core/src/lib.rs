@@ -83,6 +83,7 @@ pub mod nearby;
 pub mod noise_learning;
 pub mod odometry;
 pub mod odometry_bias;
+pub mod odometry_delay;
 pub mod odometry_monitor;
 pub mod odometry_track;
 pub mod paper;

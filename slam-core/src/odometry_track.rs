@@ -7,7 +7,7 @@ use heapless::HistoryBuf;
 use nalgebra::Isometry2;
 
 use crate::odometry::Increment;
-use crate::pose::{exp, log, normalized};
+use crate::pose::{exp, log, normalized, turn};
 use crate::scan::ScanGeometry;
 
 /// Number of instants, evenly spread from the first to the last beam, at which a scan's motion is given.
@@ -143,6 +143,14 @@ impl<const K: usize> OdometryTrack<K> {
             };
         }
         Some(())
+    }
+
+    /// The turn from one instant to a later one, radians. `None` where that is not held wholly.
+    pub(crate) fn turn_between(&self, from_us: u64, to_us: u64) -> Option<f32> {
+        let (oldest_us, newest_us) = self.span_us()?;
+        let [before, after] =
+            self.poses_at([from_us, to_us]).filter(|_| oldest_us <= from_us && to_us <= newest_us)?;
+        Some(turn(&before, &after))
     }
 
     /// The motion from one instant to a later one, with the way travelled on it. `None` without samples.
