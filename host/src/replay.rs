@@ -6,6 +6,7 @@ use nalgebra::Isometry2;
 use slam_core::config::ConfigError;
 use slam_core::geometry::pose::pose;
 use slam_core::map::{MapCounters, MapSegment};
+use slam_core::odometry::delay::Delay;
 use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
 use slam_core::sensor::scan::SensorConfig;
 use slam_core::slam::Counters;
@@ -98,6 +99,8 @@ pub struct Replay {
     pub impossible_steps: usize,
     /// When both counters had been restarted, microseconds.
     pub restarts_us: Vec<u64>,
+    /// By how much scans were stamped late, beyond what the robot file says.
+    pub delay: Option<Delay>,
     /// The robot.
     pub robot: Robot,
 }
@@ -121,7 +124,7 @@ pub fn run(
     robot.apply(&mut config, &log.layout(0));
     if log.odometry.is_empty() {
         config.odometry.noise = UNKNOWN_MOTION;
-        config.odometry.bias = None;
+        (config.odometry.bias, config.odometry.delay) = (None, None);
     }
     match beams {
         ..=URG_BEAMS => run_sized::<URG_BEAMS>(log, robot, config, progress),
@@ -155,7 +158,8 @@ fn run_sized<const BEAMS: usize>(
             mapper.set_sensor(sensor).map_err(refused)?;
         }
         let middle_us = (scan.stamp_us + STAMP_OFFSET_US).saturating_add_signed(-delay_us);
-        feed.advance(&mut mapper, middle_us + sensor.geometry.sweep_us() / 2);
+        let until_us = mapper.wanted_until_us(middle_us);
+        feed.advance(&mut mapper, until_us);
         let motion = mapper.motion(middle_us).unwrap_or_else(|| mapper.unknown_motion(middle_us));
         let started = Instant::now();
         let update = mapper.scan_with(middle_us, &scan.ranges_mm, &motion);
@@ -196,6 +200,7 @@ fn run_sized<const BEAMS: usize>(
         distance_m,
         impossible_steps: mapper.counters().impossible_steps as usize,
         restarts_us: feed.restarts_us,
+        delay: mapper.delay(),
         robot: robot.clone(),
     })
 }

@@ -9,10 +9,13 @@ use core::mem::MaybeUninit;
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::{ConfigError, SlamConfig};
+use crate::geometry::pose::turn;
+use crate::odometry::delay::{Delay, DelayEstimator, RATE_WITHIN_US};
 use crate::odometry::track::{OdometryTrack, ScanMotion};
 use crate::odometry::{DifferentialDrive, Increment};
 use crate::sensor::scan::{Scan, SensorConfig};
 use crate::slam::{Slam, SlamUpdate};
+use crate::tracking::correction::Verdict;
 
 /// Wheel ticks at an instant.
 ///
@@ -40,6 +43,13 @@ pub const UNKNOWN_SPEED: [f32; 2] = [0.5, 1.0];
 
 /// How long a reset may take, microseconds: the wait of a watchdog and the boot, with room to spare. The wheels may go on turning.
 const RESET_US: u64 = 10_000_000;
+
+/// An instant on both clocks, microseconds: that of the odometry, and that which stamps scans, late by what is used of the delay.
+#[derive(Clone, Copy)]
+struct PoseInstant {
+    odometry_us: u64,
+    stamp_us: u64,
+}
 
 /// What happened to the odometry since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -69,7 +79,8 @@ pub struct Mapper<const N: usize, const K: usize, const BEAMS: usize = 682> {
     track: OdometryTrack<K>,
     last_ticks: Option<WheelTicks>,
     /// The instant of the pose.
-    pose_us: Option<u64>,
+    pose_at: Option<PoseInstant>,
+    delay: DelayEstimator,
     /// The motion since then up to an instant before which the track may have forgotten it.
     carried: Option<(u64, Increment)>,
     /// Set while the time of the next sample has nothing to do with that of the last.
@@ -109,7 +120,8 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
             drive,
             track: OdometryTrack::default(),
             last_ticks: None,
-            pose_us: None,
+            pose_at: None,
+            delay: DelayEstimator::default(),
             carried: None,
             resuming: None,
             counters: MapperCounters::default(),
@@ -131,9 +143,16 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
         self.counters
     }
 
-    /// The instant of the pose, microseconds: that of the last scan, or where coasting ended. `None` before both.
+    /// The instant of the pose as scans are stamped, microseconds: that of the last scan, or where coasting ended. `None` before
+    /// both.
     pub fn pose_us(&self) -> Option<u64> {
-        self.pose_us
+        self.pose_at.map(|at| at.stamp_us)
+    }
+
+    /// By how much scans are stamped late, beyond what their stamps were corrected by already. `None` where that is not
+    /// estimated, see [`OdometryConfig::delay`](crate::config::OdometryConfig::delay).
+    pub fn delay(&self) -> Option<Delay> {
+        self.slam.config().odometry.delay.as_ref().map(|config| self.delay.delay(config))
     }
 
     /// Ticks and stamp of the newest sample of ticks, unless a motion came after it.
@@ -191,7 +210,8 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
             let sigmas = Vector3::from(unseen);
             self.slam.loosen(&Matrix3::from_diagonal(&sigmas.component_mul(&sigmas)));
             self.track = OdometryTrack::default();
-            (self.pose_us, self.carried) = (Some(stamp_us), None);
+            (self.pose_at, self.carried) = (Some(PoseInstant { odometry_us: stamp_us, stamp_us }), None);
+            self.delay.interrupt();
         }
         self.carry();
         let taken = self.track.push(stamp_us, step).is_ok();
@@ -210,28 +230,50 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
 
     /// Where in the track the motion since the pose goes on.
     fn motion_from_us(&self) -> Option<u64> {
-        self.carried.map(|(until_us, _)| until_us).or(self.pose_us)
+        self.carried.map(|(until_us, _)| until_us).or(self.pose_at.map(|at| at.odometry_us))
     }
 
+    #[inline(never)]
     fn with_carried(&self, motion: Increment) -> Increment {
         self.carried.map_or(motion, |(_, carried)| carried.then(&motion))
+    }
+
+    /// What of the delay is used, microseconds.
+    fn delay_us(&self) -> i64 {
+        i64::from((self.delay.used_s() * 1e6) as i32)
+    }
+
+    /// When, on the odometry's clock, a scan's middle beam was taken: as far as there are samples, and not before the pose.
+    fn odometry_us(&self, middle_us: u64) -> u64 {
+        let at_us = middle_us.saturating_add_signed(-self.delay_us());
+        let newest_us = self.track.newest_us().map_or(middle_us, |newest_us| newest_us.max(middle_us));
+        at_us.min(newest_us).max(self.pose_at.map_or(0, |at| at.odometry_us))
+    }
+
+    /// Up to when samples of the odometry are of use for a scan whose middle beam was taken at `middle_us`, microseconds.
+    pub fn wanted_until_us(&self, middle_us: u64) -> u64 {
+        let config = self.slam.config();
+        let sweep_us = config.sensor.geometry.sweep_us() / 2;
+        let beyond_us = config.odometry.delay.map_or(sweep_us, |_| sweep_us.max(RATE_WITHIN_US));
+        middle_us.saturating_add_signed(-self.delay_us()).saturating_add(beyond_us)
     }
 
     /// How the base moved, by odometry, to a scan whose middle beam was taken at `middle_us`. `None` without odometry, and for a
     /// scan from before the pose. Work: at most 3·`K` steps and [`SWEEP_KNOTS`](crate::odometry::track::SWEEP_KNOTS).
     pub fn motion(&self, middle_us: u64) -> Option<ScanMotion> {
-        if self.pose_us.is_some_and(|pose_us| pose_us > middle_us) {
+        if self.pose_at.is_some_and(|at| at.stamp_us > middle_us) {
             return None;
         }
         let geometry = &self.slam.config().sensor.geometry;
-        let mut motion = self.track.scan_motion(self.motion_from_us(), middle_us, geometry)?;
+        let at_us = self.odometry_us(middle_us);
+        let mut motion = self.track.scan_motion(self.motion_from_us(), at_us, geometry)?;
         motion.since_previous = self.with_carried(motion.since_previous);
         Some(motion)
     }
 
     /// The same where nothing is known but how far the robot may have moved, by [`UNKNOWN_SPEED`].
     pub fn unknown_motion(&self, middle_us: u64) -> ScanMotion {
-        let since_us = self.pose_us.map_or(0, |pose_us| middle_us.saturating_sub(pose_us));
+        let since_us = self.pose_at.map_or(0, |at| middle_us.saturating_sub(at.stamp_us));
         let [distance_m, turn_rad] = UNKNOWN_SPEED.map(|speed| speed * since_us as f32 * 1e-6);
         ScanMotion::instantaneous(Increment { distance_m, turn_rad, ..Increment::identity() })
     }
@@ -248,8 +290,31 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
 
     /// Takes a scan with a motion that was asked for before, or is [unknown](Self::unknown_motion).
     pub fn scan_with(&mut self, middle_us: u64, ranges_mm: &[u16], motion: &ScanMotion) -> SlamUpdate {
-        (self.pose_us, self.carried) = (Some(middle_us), None);
-        self.slam.process_scan(&Scan { ranges_mm }, motion)
+        let at_us = self.odometry_us(middle_us);
+        (self.pose_at, self.carried) = (Some(PoseInstant { odometry_us: at_us, stamp_us: middle_us }), None);
+        let update = self.slam.process_scan(&Scan { ranges_mm }, motion);
+        self.learn_delay(at_us, &update);
+        update
+    }
+
+    /// Compares the turn by the scanner with that of the odometry.
+    fn learn_delay(&mut self, at_us: u64, update: &SlamUpdate) {
+        let config = self.slam.config();
+        let Some(delay) = config.odometry.delay else { return };
+        let left_out = update.odometry_left_out || update.odometry_useless || update.closure.is_some();
+        let fixed = update.observability.verdict == Verdict::Full
+            && update.support >= config.state.good_score
+            && !left_out;
+        match self.turn_rate(at_us).filter(|_| fixed) {
+            Some(rate) => self.delay.update(turn(&update.predicted, &update.pose), rate, &delay),
+            None => self.delay.interrupt(),
+        }
+    }
+
+    /// The odometry's turn rate around an instant, rad/s.
+    fn turn_rate(&self, at_us: u64) -> Option<f32> {
+        let (from_us, to_us) = (at_us.saturating_sub(RATE_WITHIN_US), at_us.saturating_add(RATE_WITHIN_US));
+        Some(self.track.turn_between(from_us, to_us)? * (0.5e6 / RATE_WITHIN_US as f32))
     }
 
     /// Moves on by odometry alone to an instant, or the newest sample before it, where scans stay away; a scan from before the
@@ -257,12 +322,13 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
     pub fn coast(&mut self, until_us: u64) -> Option<Isometry2<f32>> {
         let (oldest_us, newest_us) = self.track.span_us()?;
         let from_us = self.motion_from_us().unwrap_or(oldest_us);
-        let to_us = newest_us.min(until_us);
+        let to_us = newest_us.min(until_us.saturating_add_signed(-self.delay_us()));
         if to_us <= from_us {
             return None;
         }
         let motion = self.with_carried(self.track.between(from_us, to_us)?);
-        (self.pose_us, self.carried) = (Some(to_us), None);
+        let stamp_us = to_us.saturating_add_signed(self.delay_us());
+        (self.pose_at, self.carried) = (Some(PoseInstant { odometry_us: to_us, stamp_us }), None);
         Some(self.slam.coast(&motion))
     }
 
@@ -450,6 +516,70 @@ mod tests {
         let turned = components(&(before.inverse() * mapper.slam().pose())).z;
         let turn = 490.0 * f64::from(STEP_M) * 0.4 / 0.3;
         assert!((f64::from(turned) - turn.sin().atan2(turn.cos())).abs() < 1e-2, "{turned} {turn}");
+    }
+
+    #[test]
+    fn a_delay_that_cannot_be_is_refused_by_name() {
+        let refused = |break_it: fn(&mut crate::odometry::delay::DelayConfig)| {
+            let mut config = SlamConfig::default();
+            break_it(config.odometry.delay.as_mut().unwrap());
+            Mapper::<64, 64>::new(config, DRIVE).err()
+        };
+        let named = |field| Some(ConfigError::Invalid { field });
+        assert_eq!(refused(|d| d.sigma_s = 0.0), named("odometry.delay.sigma_s"));
+        assert_eq!(refused(|d| d.max_s = f32::NAN), named("odometry.delay.max_s"));
+        assert_eq!(refused(|d| d.max_sigma_s = -1.0), named("odometry.delay.max_sigma_s"));
+        assert_eq!(refused(|d| d.significance = f32::INFINITY), named("odometry.delay.significance"));
+        assert!(refused(|_| ()).is_none());
+    }
+
+    /// A robot that turns to and fro, whose scans are stamped late: the lookup follows, and coasting with it.
+    #[test]
+    fn scans_are_looked_up_by_the_delay_that_was_found() {
+        let late_us = 40_000;
+        let rate = |t: f64| 0.8 * (libm::sin(2.0 * t) + 0.5 * libm::sin(3.1 * t));
+        // Its integral, in f64.
+        let heading =
+            |t: f64| 0.8 * (0.5 * (1.0 - libm::cos(2.0 * t)) + 0.5 / 3.1 * (1.0 - libm::cos(3.1 * t)));
+        assert!((heading(1.001) - heading(1.0) - 0.001 * rate(1.0005)).abs() < 1e-6);
+        let mut mapper = Mapper::<64, 64>::new(SlamConfig::default(), None).unwrap();
+        // A square room, seen from its middle and from a scanner in it.
+        let mounting = mapper.slam().config().sensor.mounting.base_from_laser;
+        let geometry = mapper.slam().config().sensor.geometry;
+        let mut said = 0.0;
+        for k in 0..12_000u64 {
+            let stamp_us = 10_000 * k;
+            let turned = heading(stamp_us as f64 * 1e-6) - said;
+            said += turned;
+            let moved = Increment::from_motion(crate::geometry::pose::pose(0.0, 0.0, turned as f32));
+            mapper.push_motion(stamp_us, moved);
+            // What was taken 0.15 s ago is delivered.
+            if k % 10 == 0 && k > 40 {
+                let taken_s = (stamp_us - 150_000) as f64 * 1e-6;
+                let ranges: [u16; 682] = core::array::from_fn(|beam| {
+                    let at_s = taken_s + (beam as f64 - 340.5) / 1024.0 * 0.1;
+                    let map_from_laser =
+                        crate::geometry::pose::pose(0.0, 0.0, heading(at_s) as f32) * mounting;
+                    let way = map_from_laser.rotation * Isometry2::rotation(geometry.bearing(beam));
+                    let (c, s) = (way.rotation.re, way.rotation.im);
+                    let from = map_from_laser.translation.vector;
+                    let to_wall = |from: f32, along: f32, half: f32| {
+                        if along.abs() < 1e-6 { f32::MAX } else { (half * along.signum() - from) / along }
+                    };
+                    (1000.0 * to_wall(from.x, c, 1.7).min(to_wall(from.y, s, 2.3))) as u16
+                });
+                let middle_us = stamp_us - 150_000 + late_us;
+                mapper.scan(middle_us, &ranges).unwrap();
+                assert_eq!(mapper.pose_us(), Some(middle_us));
+            }
+        }
+        let delay = mapper.delay().unwrap();
+        assert!((delay.delay_s - 0.04).abs() < 0.008 && delay.used, "{delay:?}");
+        // On the scans' clock.
+        let pose_us = mapper.pose_us().unwrap();
+        assert!(mapper.coast(pose_us - 5_000).is_none() && mapper.coast(pose_us + 20_000).is_some());
+        assert_eq!(mapper.pose_us(), Some(pose_us + 20_000));
+        assert!(mapper.motion(pose_us).is_none());
     }
 
     #[test]

@@ -103,6 +103,13 @@ pub fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {
         ),
         ("RAM of Slam", format!("{} bytes", report.slam_bytes)),
     ];
+    if let Some(odometry) = report.odometry.as_ref().filter(|odometry| odometry.delay_used) {
+        let beyond = "beyond scan_delay_s of the robot file; used";
+        rows.push((
+            "scans stamped late by",
+            format!("{:.3} s, sigma {:.3} s, {beyond}", odometry.delay_s, odometry.delay_sigma_s),
+        ));
+    }
     if let Some(simulation) = &report.simulation {
         rows.extend(simulation.rows());
     }

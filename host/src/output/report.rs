@@ -44,6 +44,8 @@ pub struct Report {
     pub observability: BTreeMap<&'static str, usize>,
     /// Scans by how far the pose was to be relied on, and what became of the odometry.
     pub tracking: Tracking,
+    /// What was found out about the odometry, where there is one.
+    pub odometry: Option<OdometryReport>,
     /// Counters of the core.
     pub counters: Counters,
     /// Counters of the map.
@@ -57,6 +59,17 @@ pub struct Report {
     pub simulation: Option<SimulationReport>,
     /// Every setting.
     pub config: SlamConfig,
+}
+
+/// What was found out about the odometry.
+#[derive(Debug, Serialize)]
+pub struct OdometryReport {
+    /// By how much scans were stamped late, beyond what the robot file says, seconds.
+    pub delay_s: f32,
+    /// Standard deviation of that, seconds.
+    pub delay_sigma_s: f32,
+    /// Whether it was known well enough to be used in the end.
+    pub delay_used: bool,
 }
 
 /// The truth's word on a simulated drive.
@@ -173,6 +186,11 @@ impl Report {
             scan_us: Percentiles::of(replay.steps.iter().map(|s| s.took)),
             observability,
             tracking: Tracking::of(&replay.steps),
+            odometry: replay.delay.map(|delay| OdometryReport {
+                delay_s: delay.delay_s,
+                delay_sigma_s: delay.sigma_s,
+                delay_used: delay.used,
+            }),
             counters: replay.counters,
             map_counters: replay.map_counters,
             slam_bytes: replay.slam_bytes,

@@ -54,6 +54,13 @@ pub fn difference(to: &Isometry2<f32>, from: &Isometry2<f32>) -> Vector3<f32> {
     off
 }
 
+/// Turn from one pose to another, in [-π, π].
+#[inline(never)]
+pub fn turn(from: &Isometry2<f32>, to: &Isometry2<f32>) -> f32 {
+    let turn = from.rotation.conjugate() * to.rotation;
+    atan2(turn.im, turn.re)
+}
+
 /// A vector turned by +90°: M·v with M = [[0, -1], [1, 0]] of the paper.
 #[inline]
 pub fn perpendicular(v: Vector2<f32>) -> Vector2<f32> {

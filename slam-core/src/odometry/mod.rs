@@ -8,6 +8,7 @@
 //! variances grow in proportion to the way travelled, so that it does not depend on how a path was cut into steps.
 
 pub mod bias;
+pub mod delay;
 pub(crate) mod health;
 pub mod monitor;
 pub mod noise_learning;
@@ -73,6 +74,7 @@ impl DifferentialDrive {
     }
 
     /// Whether wheels can turn so far within a time: by [`MOST_SPEED_M_S`], and by [`LEAST_JUMP_M`] whatever the time.
+    #[inline(never)]
     pub fn is_possible(&self, left_ticks: i32, right_ticks: i32, within_us: u64) -> bool {
         let metres = |ticks: i32, radius_m: f32| {
             (ticks as f32 * (2.0 * core::f32::consts::PI / self.ticks_per_turn) * radius_m).abs()

@@ -5,7 +5,7 @@ use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 use super::heading_search::{self, MAX_PEAKS};
 use super::hypothesis::{Hypothesis, tight_score};
-use crate::config::{ConfigError, SlamConfig, not_negative};
+use crate::config::{Checked, SlamConfig, not_negative};
 use crate::frontend::extraction::MAX_SEGMENTS;
 use crate::geometry::math::{min, sin_cos};
 use crate::geometry::pose::{components, difference, perpendicular, pose};
@@ -91,7 +91,7 @@ impl SearchConfig {
             + (early * early.transpose() + late * late.transpose()) * (0.5 * heading * heading)
     }
 
-    pub(crate) fn validate(&self) -> Result<(), ConfigError> {
+    pub(crate) fn validate(&self) -> Checked {
         let fields = [
             ("correction.maximum_a_posteriori.search.below_score", self.below_score),
             ("correction.maximum_a_posteriori.search.reach_rad", self.reach_rad),
