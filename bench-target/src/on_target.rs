@@ -28,6 +28,9 @@ include!(concat!(env!("OUT_DIR"), "/set.rs"));
 const CAPACITY: usize = 512;
 /// Segments known at the start of a run.
 const KNOWN: [usize; 3] = [50, 200, 500];
+/// Wheels that slip: in one of so many scans the odometry is off by this turn, radians, so that the pose must be searched for.
+const SLIP_SCANS: usize = 5;
+const SLIP_RAD: f32 = 0.4;
 /// Turns of a loop counted by hand.
 const TURNS: u32 = 1000;
 /// Times that a function is called.
@@ -45,8 +48,11 @@ fn main() -> ! {
         [("default", SlamConfig::default as fn() -> SlamConfig), ("paper", SlamConfig::paper)]
     {
         for known in KNOWN {
-            run(name, config(), known);
+            run(name, config(), known, None);
         }
+    }
+    for known in KNOWN {
+        run("slipping", SlamConfig::default(), known, Some(SLIP_RAD));
     }
     defmt::println!("end of benchmark");
     loop {
@@ -54,8 +60,8 @@ fn main() -> ! {
     }
 }
 
-/// The fixed set of scans through the core, with so many segments known.
-fn run(name: &str, config: SlamConfig, known: usize) {
+/// The fixed set of scans through the core, with so many segments known, and with wheels that slip or do not.
+fn run(name: &str, config: SlamConfig, known: usize, slip_rad: Option<f32>) {
     static mut SLAM: MaybeUninit<Slam<CAPACITY>> = MaybeUninit::uninit();
     // SAFETY: called from the only thread there is, and never from within itself.
     let place = unsafe { &mut *core::ptr::addr_of_mut!(SLAM) };
@@ -66,8 +72,13 @@ fn run(name: &str, config: SlamConfig, known: usize) {
     let [x, y, heading] = BEGIN;
     slam.take_up(&MAP[..known], pose(x, y, heading));
     defmt::println!("run {=str} {=usize}", name, known);
-    for (ranges_mm, motion) in RANGES_MM.iter().zip(&MOTIONS) {
-        let motion = scan_motion(motion);
+    for (k, (ranges_mm, motion)) in RANGES_MM.iter().zip(&MOTIONS).enumerate() {
+        let mut motion = scan_motion(motion);
+        if let Some(slip_rad) = slip_rad.filter(|_| k % SLIP_SCANS == SLIP_SCANS - 1) {
+            motion.since_previous.before_from_after *= pose(0.0, 0.0, slip_rad);
+            motion.since_previous.turn_rad += slip_rad;
+        }
+        let searched = slam.counters().searched;
         let mut cycles = [0u32; Stage::COUNT];
         let mut current = Stage::Prediction;
         let mut since = DWT::cycle_count();
@@ -80,7 +91,15 @@ fn run(name: &str, config: SlamConfig, known: usize) {
         let points = update.deskew.points;
         let keyframe = update.registration.keyframe;
         let segments = slam.map().segments().len();
-        defmt::println!("scan {} {=u32} {=bool} {=usize}", cycles, points, keyframe, segments);
+        let searched = slam.counters().searched > searched;
+        defmt::println!(
+            "scan {} {=u32} {=bool} {=usize} {=bool}",
+            cycles,
+            points,
+            keyframe,
+            segments,
+            searched
+        );
     }
 }
 

@@ -25,6 +25,8 @@ const LONGEST_US: u64 = 3_600_000_000;
 /// Instructions that a scan may take with the default configuration and [`BUDGET_SEGMENTS`] segments: median and 99th percentile.
 const BUDGET: [u32; 2] = [200_000, 600_000];
 const BUDGET_SEGMENTS: usize = 200;
+/// Instructions of any scan in which the pose is searched for, whatever the map.
+const SEARCH_BUDGET: u32 = 2_000_000;
 /// Between two scans.
 const SCAN_S: f64 = 0.1;
 
@@ -103,6 +105,8 @@ pub struct Counted {
     pub keyframe: bool,
     /// Segments of the map afterwards.
     pub segments: usize,
+    /// Whether the pose was searched for.
+    pub searched: bool,
 }
 
 impl Counted {
@@ -203,12 +207,15 @@ impl Measured {
                     rest.strip_prefix('[').and_then(|r| r.split_once("] ")).context("no list of stages")?;
                 let counts: Vec<u32> = stages.split(", ").map(str::parse).collect::<Result<_, _>>()?;
                 let words: Vec<&str> = rest.split(' ').collect();
-                let [points, keyframe, segments] = words[..] else { bail!("three words are expected") };
+                let [points, keyframe, segments, searched] = words[..] else {
+                    bail!("four words are expected")
+                };
                 let scan = Counted {
                     stages: counts.try_into().ok().context("another number of stages")?,
                     points: points.parse()?,
                     keyframe: keyframe.parse()?,
                     segments: segments.parse()?,
+                    searched: searched.parse()?,
                 };
                 self.runs.last_mut().context("a scan before its run")?.scans.push(scan);
             }
@@ -265,6 +272,12 @@ impl Measured {
         Ok([median, p99])
     }
 
+    /// How many scans searched for the pose, and what the dearest of them took.
+    fn searches(&self) -> [u32; 2] {
+        let scans = self.runs.iter().flat_map(|r| &r.scans).filter(|s| s.searched);
+        scans.fold([0, 0], |[count, most], scan| [count + 1, most.max(scan.total())])
+    }
+
     /// What a loop costs for each turn.
     fn turn(&self, name: &str) -> anyhow::Result<u32> {
         let kernel = self.kernels.iter().find(|(kernel, _, _)| kernel == name);
@@ -297,6 +310,10 @@ impl Report {
             "\ndefault, {BUDGET_SEGMENTS} segments: median {median}, p99 {p99} instructions; {} and {} are allowed",
             BUDGET[0], BUDGET[1]
         );
+        let [searches, dearest] = instructions.searches();
+        println!(
+            "search for the pose: {dearest} instructions at the most, of {searches} scans; {SEARCH_BUDGET} are allowed"
+        );
         let share = |count: u32| 100.0 * f64::from(count) / (CLOCK_HZ.get() as f64 * SCAN_S);
         let timed = cycles.budgeted()?;
         println!(
@@ -314,6 +331,11 @@ impl Report {
             "a scan takes {median} instructions at the median and {p99} at the 99th percentile; {} and {} are allowed",
             BUDGET[0],
             BUDGET[1]
+        );
+        ensure!(searches > 0, "no scan searched for the pose");
+        ensure!(
+            dearest <= SEARCH_BUDGET,
+            "a scan that searches for the pose takes {dearest} instructions; {SEARCH_BUDGET} are allowed"
         );
         check_assumed_cycles(self.pace.tally.cycles_per_instruction())
     }
@@ -372,18 +394,21 @@ mod tests {
     #[test]
     fn what_the_firmware_says_is_taken_and_what_is_none_of_it_is_refused() {
         let mut measured = Measured::default();
-        assert!(measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 50").is_err(), "no run has begun");
+        assert!(measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 50 false").is_err(), "no run has begun");
         measured.take("run default 50").unwrap();
-        measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 51").unwrap();
+        measured.take("scan [1, 2, 3, 4, 5, 6] 600 true 51 false").unwrap();
+        measured.take("scan [1, 2, 3, 4, 5, 7] 600 true 51 true").unwrap();
         measured.take("function sin 1262 22 0.0000001 0.002").unwrap();
         let sin = Function { name: "sin".to_owned(), instructions: [1262, 22], errors: [1e-7, 2e-3] };
         assert_eq!(measured.functions, [sin]);
         let scan = measured.runs[0].scans[0];
         assert_eq!((scan.total(), scan.points, scan.keyframe, scan.segments), (21, 600, true, 51));
+        assert_eq!(measured.searches(), [1, 22]);
         for bad in [
             "",
-            "scan [1, 2] 600 true 51",
-            "scan [1, 2, 3, 4, 5, x] 1 true 1",
+            "scan [1, 2] 600 true 51 false",
+            "scan [1, 2, 3, 4, 5, 6] 600 true 51",
+            "scan [1, 2, 3, 4, 5, x] 1 true 1 false",
             "run default",
             "walk 1",
             "function sin 1 2",

@@ -207,7 +207,7 @@ impl Default for SlamConfig {
                     nothing_score: 0.3,
                     wild_chi2: 30.0,
                     suspicious_chi2: 6.0,
-                    suspicious_scans: 3,
+                    suspicious_scans: 2,
                     found_score: 0.6,
                     found_segments: 4.0,
                 },

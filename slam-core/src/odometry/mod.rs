@@ -152,6 +152,9 @@ impl Increment {
     }
 }
 
+/// Share of the floors that is left when nothing moved.
+const AT_REST: f32 = 0.1;
+
 /// How fast odometry grows uncertain. Each figure is a standard deviation that grows with the square root of the way.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -165,7 +168,7 @@ pub struct OdometryNoise {
     pub sigma_heading_rad_per_sqrt_m: f32,
     /// Heading, radians for each √radian turned.
     pub sigma_heading_rad_per_sqrt_rad: f32,
-    /// Floor of the position's standard deviation for one increment, metres: wheels that report nothing may have slipped all the same.
+    /// Floor of the position's standard deviation for one increment, metres: in part at rest too, as wheels may slip.
     pub sigma_position_floor_m: f32,
     /// Floor of the heading's standard deviation for one increment, radians.
     pub sigma_heading_floor_rad: f32,
@@ -191,12 +194,24 @@ impl OdometryNoise {
         let (c, s) = if length > 1e-6 { (chord.x / length, chord.y / length) } else { (1.0, 0.0) };
         // What a heading error does to the end of the chord.
         let lever = pose::perpendicular(chord);
-        let floor = square(self.sigma_position_floor_m);
+        // Counters that did not move at all leave only what is finer than they are.
+        let share = if d == 0.0 && turn == 0.0 { AT_REST } else { 1.0 };
+        let floor = square(share * self.sigma_position_floor_m);
         let xx = c * c * var_along + s * s * var_across + lever.x * lever.x * var_heading / 3.0 + floor;
         let yy = s * s * var_along + c * c * var_across + lever.y * lever.y * var_heading / 3.0 + floor;
         let xy = c * s * (var_along - var_across) + lever.x * lever.y * var_heading / 3.0;
         let (xt, yt) = (0.5 * lever.x * var_heading, 0.5 * lever.y * var_heading);
-        Matrix3::new(xx, xy, xt, xy, yy, yt, xt, yt, var_heading + square(self.sigma_heading_floor_rad))
+        Matrix3::new(
+            xx,
+            xy,
+            xt,
+            xy,
+            yy,
+            yt,
+            xt,
+            yt,
+            var_heading + square(share * self.sigma_heading_floor_rad),
+        )
     }
 }
 

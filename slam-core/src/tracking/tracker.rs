@@ -56,7 +56,7 @@ pub struct SearchConfig {
     pub wild_chi2: f32,
     /// Or where it was larger than this, …
     pub suspicious_chi2: f32,
-    /// … for so many scans in a row: wheels that slip drag the pose along little by little.
+    /// … in so many scans more than it was not: wheels that slip drag the pose along little by little.
     pub suspicious_scans: u8,
     /// A lost robot is found where so much of the scan is explained, …
     pub found_score: f32,
@@ -173,7 +173,7 @@ pub struct Tracker<const N: usize> {
     iterations: u8,
     /// Where a lost robot looks next.
     looks: u8,
-    /// Predictions in a row that were suspiciously far off.
+    /// Predictions that were suspiciously far off, less those that were not.
     suspicious: u8,
 }
 
@@ -293,7 +293,11 @@ impl<const N: usize> Tracker<N> {
         let broad = Prior { covariance: prior.covariance + search.widening(&moved), ..*prior };
         let mut by_scan = false;
         let suspicious = tracked.innovation_chi2 > search.suspicious_chi2;
-        self.suspicious = if suspicious { self.suspicious.saturating_add(1) } else { 0 };
+        self.suspicious = if suspicious {
+            self.suspicious.saturating_add(1).min(search.suspicious_scans)
+        } else {
+            self.suspicious.saturating_sub(1)
+        };
         let wild = tracked.innovation_chi2 > search.wild_chi2 || self.suspicious >= search.suspicious_scans;
         if wild && best.observability.verdict == Verdict::Full {
             let start = Hypothesis::at(best.pose, best.covariance);
