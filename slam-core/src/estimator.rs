@@ -74,13 +74,13 @@ struct Moved {
 }
 
 impl Estimator {
-    /// At the origin and sure of it, without a filter. Inlined, so that it is built in its place.
+    /// At the origin and sure of it, with a filter that is not prepared. Inlined, so that it is built in its place.
     #[inline(always)]
     pub fn blank() -> Self {
         Self {
             map_from_base: Isometry2::identity(),
             local_covariance: Matrix3::zeros(),
-            joint: None,
+            joint: Some(Joint::blank()),
             keyframe: Keyframe::at(Isometry2::identity(), AmongLines::default()),
             sightings: Sightings::default(),
             settled: Settled::default(),
@@ -89,10 +89,13 @@ impl Estimator {
         }
     }
 
-    /// Makes the filter that the configuration asks for.
+    /// Prepares the filter where the configuration asks for one, and drops it where not.
     pub fn prepare(&mut self, config: &SlamConfig) {
-        if config.registration.joint().is_some() {
-            self.joint.insert(Joint::blank()).prepare(config.odometry.bias_sigmas());
+        match &mut self.joint {
+            Some(joint) if config.registration.joint().is_some() => {
+                joint.prepare(config.odometry.bias_sigmas())
+            }
+            joint => *joint = None,
         }
     }
 
