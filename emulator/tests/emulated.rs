@@ -109,9 +109,12 @@ fn a_sensor_that_streams_at_another_bit_rate_is_taken_over() {
 #[test]
 fn a_reset_by_pin_while_driving_keeps_map_and_pose() {
     let mut half_done = 0;
-    // Over one period of the scans: between two of them, and in the middle of the work on one.
-    for at in ["25.00", "25.02", "25.04", "25.06", "25.08"] {
-        let (outcome, judged) = hall(Some(40), &[&format!("reset@{at}")]);
+    // Over one period of the scans: in the middle of the work on one, which takes some 4 ms and is read up to 1 ms after its end, and
+    // between two of them.
+    let (undisturbed, _) = hall(Some(26), &[]);
+    let read_us = scans(&undisturbed.entries).map(|e| e.read_us).find(|us| *us >= 25_000_000).unwrap();
+    for at in [0.0, 0.02, 0.04, 0.06, 0.08].map(|later_s| (read_us - 2_500) as f64 * 1e-6 + later_s) {
+        let (outcome, judged) = hall(Some(40), &[&format!("reset@{at:.4}")]);
         assert_eq!(outcome.resets.len(), 1, "{at}");
         assert!(says(&outcome, "INFO", "reset by Pin"), "{at}");
         assert!(says(&outcome, "INFO", "is kept"), "{at}");
@@ -126,7 +129,7 @@ fn a_reset_by_pin_while_driving_keeps_map_and_pose() {
             judged.report.worst_position_error_m
         );
         // The map goes on where it was.
-        let before = outcome.entries.iter().rev().find(|e| e.read_us < 25_000_000).unwrap().segments;
+        let before = outcome.entries.iter().rev().find(|e| (e.read_us as f64) < at * 1e6).unwrap().segments;
         assert!(outcome.entries.last().unwrap().segments + 5 >= before, "{at}");
         assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None, "{at}");
     }

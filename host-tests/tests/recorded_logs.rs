@@ -27,7 +27,7 @@ struct Recorded {
 
 const LOGS: [Recorded; 5] = [
     Recorded { name: "exp1", file: "exp1.dat.gz", limit_m: 0.22, noisy_limit_m: 0.35 },
-    Recorded { name: "csail", file: "csail.log.gz", limit_m: 0.90, noisy_limit_m: 4.0 },
+    Recorded { name: "csail", file: "csail.log.gz", limit_m: 0.60, noisy_limit_m: 3.0 },
     Recorded { name: "fr079", file: "fr079.log.gz", limit_m: 0.10, noisy_limit_m: 0.25 },
     Recorded { name: "fr101", file: "fr101.log.gz", limit_m: 0.06, noisy_limit_m: 0.1 },
     Recorded { name: "seattle", file: "seattle.log.gz", limit_m: 0.09, noisy_limit_m: 0.15 },
