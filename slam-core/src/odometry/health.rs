@@ -71,7 +71,7 @@ impl OdometryHealth {
         let increment = if self.is_useless() {
             Some(self.monitor.expected())
         } else {
-            self.monitor.made_up(&motion.since_previous)
+            self.monitor.late_remainder(&motion.since_previous)
         };
         increment.map(|increment| motion.evenly(increment))
     }

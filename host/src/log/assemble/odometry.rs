@@ -14,6 +14,7 @@ use crate::score::Spread;
 /// Poses of two sources that are farther apart than this, metres, are not of one odometry: on logs that were corrected afterwards
 /// (fhw, freiburg-101) the median is 0.04 m.
 const MOST_CONTRADICTION_M: f64 = 0.01;
+
 impl Assembly<'_> {
     /// Odometry with increasing stamps.
     pub(super) fn settle_odometry(&mut self, records: Vec<OdometryRecord>, settled: &Settled) {
