@@ -173,7 +173,7 @@ impl Default for SlamConfig {
                 offset_per_residual: 0.8,
                 odometry_pieces: 8.0,
                 piece_m: 0.5,
-                least_share: 0.3,
+                least_share: 0.1,
                 max_sigma_m: 0.06,
             }),
             association: AssociationConfig::Gated(GateConfig {
