@@ -6,33 +6,10 @@
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Vector2};
 
+use crate::geometry::line_noise::LineNoise;
 use crate::geometry::math::min;
 use crate::geometry::pose::{cross, perpendicular};
 use crate::geometry::segment::Segment;
-
-/// Error of a line that does not average out over its points: walls are not straight, sensors have a bias.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct LineNoise {
-    /// Standard deviation of a line's offset, metres.
-    pub sigma_offset_m: f32,
-    /// Standard deviation of a line's direction, radians.
-    pub sigma_direction_rad: f32,
-}
-
-impl LineNoise {
-    /// Variance of a line's offset, m².
-    pub fn var_offset(&self) -> f32 {
-        self.sigma_offset_m * self.sigma_offset_m
-    }
-
-    /// Variance of the direction of a line of this length, rad²: the shorter it is, the more an offset of its parts
-    /// turns it. Infinite at length zero.
-    pub fn var_direction(&self, length_m: f32) -> f32 {
-        self.sigma_direction_rad * self.sigma_direction_rad + 12.0 * self.var_offset() / (length_m * length_m)
-    }
-}
 
 /// Residual of one pair, linear in the pose.
 #[derive(Clone, Copy, Debug)]
@@ -139,7 +116,7 @@ mod tests {
     #[test]
     fn information_is_that_of_point_to_line_least_squares() {
         let mut map = wall(40, |_| 0.0);
-        map = crate::ekf::joint::with_variances(&map, 1e-12, 1e-12); // a map line known perfectly
+        map = crate::geometry::line_noise::with_variances(&map, 1e-12, 1e-12); // a map line known perfectly
         let observed = wall(25, |_| 0.0);
         let position = Point2::new(0.3, -0.2);
         let r = Residual::new(&observed, &map, position, &NOISE).unwrap();
