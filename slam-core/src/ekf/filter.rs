@@ -15,10 +15,10 @@
 
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
-use crate::ekf::measurement::pose_jacobian;
 use crate::ekf::slots::Slots;
 use crate::ekf::state::{Covariance, FIRST_LINE, LINES, ODOMETRY, POSE, STATES, line_states};
 use crate::geometry::line_noise::with_variances;
+use crate::geometry::line_observation::by_pose;
 use crate::geometry::math::{VARIANCE_FLOOR, max, within};
 use crate::geometry::pose::{components, pose};
 use crate::geometry::segment::Segment;
@@ -183,7 +183,7 @@ impl EkfSlam {
             // The normal turns away from the direction.
             let normal_by = -line.direction * core::mem::take(turned);
             let from_robot = line.moments.centroid.coords - pose.translation.vector;
-            let [[x, y, heading], _] = pose_jacobian(normal_by, from_robot);
+            let [[x, y, heading], _] = by_pose(normal_by, from_robot);
             let [offset, _] = line_states(slot);
             self.covariance.add_multiples(offset, &[(POSE, x), (POSE + 1, y), (POSE + 2, heading)]);
         }

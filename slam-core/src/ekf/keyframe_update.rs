@@ -17,7 +17,7 @@ use crate::ekf::merging::merge_walls;
 use crate::ekf::state::UpdateScope;
 use crate::frontend::extraction::MAX_SEGMENTS;
 use crate::geometry::line_noise::{LineNoise, variances, with_variances};
-use crate::geometry::math::min;
+use crate::geometry::line_observation::{LineObservation, ObservationNoise};
 use crate::geometry::pose::{difference, is_finite};
 use crate::geometry::segment::Segment;
 use crate::map::nearby::Nearby;
@@ -329,11 +329,10 @@ impl Pair {
     ) -> Option<Measurement> {
         let segment = seen.segments.get(self.observed)?;
         let mapped = &map.segments().get(self.mapped)?.segment;
-        let length_m = min(segment.length_m(), mapped.length_m());
-        let noise = seen.sensor.line_noise.added_to(variances(segment), length_m);
-        let segment = segment.transformed(&at.pose);
-        let position = at.prior.translation.vector;
-        Some(Measurement::of_pair(slot, mapped, &segment, position, &at.since_prior(), noise))
+        let noise = ObservationNoise::new(segment, mapped, &seen.sensor.line_noise);
+        let position = at.prior.translation.vector.into();
+        let seen = LineObservation::new(&segment.transformed(&at.pose), mapped, position, noise);
+        Measurement::of_line(slot, &seen, &at.since_prior())
     }
 }
 

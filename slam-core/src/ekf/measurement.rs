@@ -1,10 +1,11 @@
 //! A measurement as the filter takes it: the innovation of a line's offset and direction, its noise R, and its Jacobian H by the
 //! states.
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::Vector3;
 
 use crate::ekf::state::{POSE, STATES, line_states};
-use crate::geometry::pose::{cross, perpendicular};
+use crate::geometry::line_observation::LineObservation;
+use crate::geometry::pose::cross;
 use crate::geometry::segment::Segment;
 
 /// Difference between two lines, in offset (m) and direction (rad), linear in the error state δ: r(δ) = r(0) + H·δ.
@@ -71,26 +72,16 @@ impl Jacobian {
 }
 
 impl Measurement {
-    /// An observed segment, already in `map` through some pose, against the map's line in a slot. `since_prior` leads from the
-    /// prior's (x, y, θ) to that pose.
-    pub fn of_pair(
-        slot: usize,
-        mapped: &Segment,
-        seen: &Segment,
-        prior_position: Vector2<f32>,
-        since_prior: &Vector3<f32>,
-        noise: [f32; 2],
-    ) -> Self {
-        let centroid = seen.moments.centroid;
-        let apart = centroid - mapped.moments.centroid;
-        let by_pose = pose_jacobian(mapped.normal(), centroid.coords - prior_position);
-        let [offset, direction] = by_pose.map(|by| Vector3::from(by).dot(since_prior));
+    /// An observation of the line in a slot. `since_prior` leads from the prior's (x, y, θ), where the error state is zero, to the pose
+    /// through which it was observed. `None` for lines without extent.
+    pub fn of_line(slot: usize, seen: &LineObservation, since_prior: &Vector3<f32>) -> Option<Self> {
+        let [offset, direction] = seen.by_pose.map(|by| Vector3::from(by).dot(since_prior));
         // The residual at the prior: that at the pose, less what the way from there has changed.
-        let residual =
-            [mapped.normal().dot(&apart) - offset, cross(mapped.direction, seen.direction) - direction];
-        let by_line = [[-1.0, -mapped.direction.dot(&apart)], [0.0, -1.0]];
-        let by_lines = heapless::Vec::from_slice(&[(slot, by_line)]).unwrap_or_default();
-        Self { residual, noise, jacobian: Jacobian { by_pose, by_lines } }
+        let residual = [seen.residual[0] - offset, seen.residual[1] - direction];
+        let noise = seen.noise.variances();
+        let by_lines = heapless::Vec::from_slice(&[(slot, seen.by_line)]).unwrap_or_default();
+        let jacobian = Jacobian { by_pose: seen.by_pose, by_lines };
+        noise.iter().all(|variance| variance.is_finite()).then_some(Self { residual, noise, jacobian })
     }
 
     /// Two lines of the map that are one wall, each with its slot: a constraint between them.
@@ -103,10 +94,4 @@ impl Measurement {
         let residual = [a.normal().dot(&apart), cross(a.direction, b.direction)];
         Self { residual, noise, jacobian: Jacobian { by_pose: [[0.0; 3]; 2], by_lines } }
     }
-}
-
-/// Jacobian by the pose (x, y, θ) of the offset at a point this far from the robot, and of the direction, of a line with this
-/// normal that the robot carries along: of ρ = n·p, and of θ.
-pub(crate) fn pose_jacobian(normal: Vector2<f32>, from_robot: Vector2<f32>) -> [[f32; 3]; 2] {
-    [[normal.x, normal.y, normal.dot(&perpendicular(from_robot))], [0.0, 0.0, 1.0]]
 }

@@ -9,9 +9,10 @@ use core::num::NonZeroU16;
 use nalgebra::Vector2;
 
 use crate::ekf::filter::EkfSlam;
-use crate::ekf::measurement::{Jacobian, pose_jacobian};
+use crate::ekf::measurement::Jacobian;
 use crate::ekf::state::{FIRST_LINE, LINES, STATES, line_states};
 use crate::geometry::line_noise::{variances, with_variances};
+use crate::geometry::line_observation::by_pose;
 use crate::map::SegmentMap;
 
 /// A line of the map: its index there.
@@ -141,7 +142,7 @@ impl EkfSlam {
     ) {
         let Some(segment) = map.segments().get(index).map(|s| s.segment) else { return };
         let [var_offset, var_direction] = variances(&segment);
-        let by_pose = pose_jacobian(segment.normal(), segment.moments.centroid.coords - position);
+        let by_pose = by_pose(segment.normal(), segment.moments.centroid.coords - position);
         let jacobian = Jacobian::by_pose(by_pose);
         let slot = self.take_slot(map);
         let mut pgt = [[0.0; STATES]; 2];

@@ -1,12 +1,13 @@
 //! A simulated robot for the filter's tests.
 
-use nalgebra::{Isometry2, Matrix3, Vector3};
+use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 use crate::ekf::filter::EkfSlam;
 use crate::ekf::measurement::Measurement;
 use crate::ekf::state::UpdateScope;
 use crate::ekf::update::UpdateGate;
-use crate::geometry::line_noise::with_variances;
+use crate::geometry::line_noise::{LineNoise, with_variances};
+use crate::geometry::line_observation::{LineObservation, ObservationNoise};
 use crate::geometry::pose::rotate_covariance;
 use crate::geometry::pose::{components, perpendicular, pose};
 use crate::geometry::segment::Segment;
@@ -29,6 +30,21 @@ pub const SURE: [f32; 2] = [1e-5, 4e-5];
 pub const INFLATION: f32 = 2.0;
 pub const PLAIN: UpdateGate =
     UpdateGate { max_nis: f32::INFINITY, kernel_nis: f32::INFINITY, min_information_ratio: 0.0 };
+
+/// An observed segment, in `map`, with these variances, by a robot at a position.
+pub fn measurement(
+    slot: usize,
+    mapped: &Segment,
+    seen: &Segment,
+    position: Vector2<f32>,
+    [var_offset, var_direction]: [f32; 2],
+) -> Measurement {
+    let seen = with_variances(seen, var_offset, var_direction);
+    let exact = LineNoise { sigma_offset_m: 0.0, sigma_direction_rad: 0.0 };
+    let noise = ObservationNoise::new(&seen, mapped, &exact);
+    let observation = LineObservation::new(&seen, mapped, position.into(), noise);
+    Measurement::of_line(slot, &observation, &Vector3::zeros()).unwrap()
+}
 
 pub struct Gauss(rand_pcg::Pcg32);
 
@@ -108,8 +124,7 @@ impl World {
             let entry = self.map.get_mut(index).unwrap();
             entry.last_seen = self.scan;
             let position = self.believed.translation.vector;
-            let measurement =
-                Measurement::of_pair(slot, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
+            let measurement = measurement(slot, &entry.segment, &seen, position, SEEN);
             self.filter.update(&measurement, &PLAIN, UpdateScope::All);
         }
         self.believed = self.filter.commit(&self.believed, &mut self.map);

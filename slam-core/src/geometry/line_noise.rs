@@ -35,7 +35,13 @@ impl LineNoise {
     }
 }
 
-/// Variances of a segment's offset and direction, as its sums say.
+/// Variances of a segment's offset and direction, as its sums say; infinite where they say nothing.
+pub(crate) fn fitted_variances(segment: &Segment) -> [f32; 2] {
+    let variance = |information: f32| if information > 0.0 { 1.0 / information } else { f32::INFINITY };
+    [variance(segment.moments.weight), variance(segment.moments.scatter_along(segment.direction))]
+}
+
+/// The same for a covariance, which must be finite: 10⁹ at most.
 pub(crate) fn variances(segment: &Segment) -> [f32; 2] {
     let variance = |information: f32| 1.0 / max(information, 1e-9);
     [variance(segment.moments.weight), variance(segment.moments.scatter_along(segment.direction))]

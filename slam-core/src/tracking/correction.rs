@@ -11,9 +11,9 @@
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
 use crate::geometry::line_noise::LineNoise;
+use crate::geometry::line_observation::Residual;
 use crate::geometry::math::{max, min, sqrt};
 use crate::geometry::pose::{components, perpendicular, pose};
-use crate::geometry::residual::Residual;
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
 use crate::paper::least_squares::LeastSquaresConfig;

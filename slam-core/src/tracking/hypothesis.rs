@@ -3,8 +3,8 @@
 use nalgebra::{Isometry2, Matrix2, Matrix3};
 
 use crate::geometry::line_noise::LineNoise;
+use crate::geometry::line_observation::Residual;
 use crate::geometry::math::{max, within};
-use crate::geometry::residual::Residual;
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
 use crate::tracking::association::Pair;

@@ -1,7 +1,7 @@
 use nalgebra::Vector3;
 
 use super::*;
-use crate::ekf::world::{INFLATION, PLAIN, SEEN, SURE, World};
+use crate::ekf::world::{INFLATION, PLAIN, SEEN, SURE, World, measurement};
 use crate::geometry::pose::components;
 
 #[test]
@@ -14,7 +14,7 @@ fn in_the_scope_of_a_line_only_that_line_changes() {
     let slot = world.filter.activate(0, INFLATION, &mut world.map).unwrap();
     let seen = entry.segment.shifted(0.05, 0.1);
     let position = world.believed.translation.vector;
-    let measurement = Measurement::of_pair(slot, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
+    let measurement = measurement(slot, &entry.segment, &seen, position, SEEN);
     world.filter.update(&measurement, &PLAIN, UpdateScope::Line(slot));
     assert_eq!(world.filter.pose_covariance(), before.pose_covariance());
     let same = world.filter.commit(&world.believed, &mut world.map);
@@ -33,8 +33,7 @@ fn the_test_uses_the_same_covariance_as_the_update() {
         let entry = world.map.segments()[index];
         let Some(slot) = world.filter.slot_of(index) else { continue };
         let seen = entry.segment.shifted(0.02, 0.01);
-        let measurement =
-            Measurement::of_pair(slot, &entry.segment, &seen, position, &Vector3::zeros(), SEEN);
+        let measurement = measurement(slot, &entry.segment, &seen, position, SEEN);
         let test = world.filter.test(&measurement);
         let mut with = [[0.0; STATES]; 2];
         world.filter.covariance_times(&measurement.jacobian, &mut with);
@@ -69,13 +68,12 @@ fn deferred_downdates_are_those_made_at_once() {
         .map(|(index, slot)| {
             let segment = world.map.segments()[index].segment;
             let seen = segment.shifted(0.01 * world.gauss.draw(), 0.02 * world.gauss.draw());
-            let since = Vector3::zeros();
             let scope = match index % 5 {
                 2 => UpdateScope::RobotAndLine(slot),
                 4 => UpdateScope::Line(slot),
                 _ => UpdateScope::All,
             };
-            (Measurement::of_pair(slot, &segment, &seen, position, &since, SURE), scope)
+            (measurement(slot, &segment, &seen, position, SURE), scope)
         })
         .collect();
     assert!(measurements.len() > 8);
