@@ -362,8 +362,7 @@ impl Estimator {
         let last = self.keyframe;
         let moved = self.moved(&last.map_from_base, &last.since, around);
         if let Some(filter) = &mut self.filter {
-            let turn = last.map_from_base.rotation.to_rotation_matrix().to_homogeneous();
-            let by_odometry = turn * OdometryBias::derivative(&last.since);
+            let by_odometry = by_odometry(&last.map_from_base, &last.since);
             filter.predict(&moved.by_pose, &by_odometry, &moved.noise, around.map);
         }
         // Of no scan yet: the pose may have been corrected since.
@@ -398,10 +397,16 @@ impl Estimator {
     }
 }
 
+/// Jacobian of the pose that an increment leads to, in `map`, by the odometry's errors.
+fn by_odometry(from: &Isometry2<f32>, increment: &Increment) -> Matrix3<f32> {
+    let turn = from.rotation.to_rotation_matrix().to_homogeneous();
+    turn * OdometryBias::derivative(increment)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::{components, difference, pose};
+    use crate::geometry::pose::{components, difference, exp, pose};
     use nalgebra::Point2;
 
     /// All that an estimator works with, around a robot that has seen nothing.
@@ -462,6 +467,32 @@ mod tests {
                 let step = Vector3::ith(k, h);
                 let slope = difference(&at(step).pose, &at(-step).pose) / (2.0 * h);
                 assert!((slope - by_pose.column(k)).norm() < 1e-3, "{k}: {slope} {by_pose}");
+            }
+        }
+    }
+
+    /// Over the way between keyframes. The Jacobian takes a turn as spread over the way, which is off by a twelfth of its square.
+    #[test]
+    fn the_motion_s_jacobian_by_the_odometry_s_errors_is_the_finite_difference() {
+        let mut robot = Robot::new(SlamConfig::default());
+        let (estimator, around) = robot.with(&[]);
+        let motions = [(0.15, 0.0), (-0.15, 0.1), (0.1, -0.15), (0.0, 0.2), (0.15, 0.15)];
+        for (forward, turn) in motions {
+            let increment = Increment::from_motion(exp(&Vector3::new(forward, 0.0, turn)));
+            for heading in [0.0, 0.7, -2.0, 3.1] {
+                let from = pose(1.0, -0.5, heading);
+                let jacobian = by_odometry(&from, &increment);
+                let h = 0.05;
+                for k in 0..3 {
+                    let mut at = |error: f32| {
+                        let bias = OdometryBias(Vector3::ith(k, error));
+                        estimator.filter.as_mut().unwrap().set_bias(bias);
+                        estimator.moved(&from, &increment, &around).pose
+                    };
+                    let slope = difference(&at(h), &at(-h)) / (2.0 * h);
+                    let off = slope - jacobian.column(k);
+                    assert!(off.norm() < 3e-4, "{k} of {forward} {turn}: {slope} {jacobian}");
+                }
             }
         }
     }

@@ -87,6 +87,12 @@ impl EkfSlam {
         self.bias
     }
 
+    /// Sets them.
+    #[cfg(test)]
+    pub(crate) fn set_bias(&mut self, bias: OdometryBias) {
+        self.bias = bias;
+    }
+
     /// Covariance of the pose (x, y, θ).
     pub fn pose_covariance(&self) -> Matrix3<f32> {
         self.covariance.block(POSE)

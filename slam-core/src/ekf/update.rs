@@ -242,4 +242,6 @@ impl EkfSlam {
 }
 
 #[cfg(test)]
+mod dense;
+#[cfg(test)]
 mod tests;
