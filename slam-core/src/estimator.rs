@@ -17,6 +17,7 @@ use crate::ekf::keyframe::{Anchor, Keyframe, KeyframeConfig, LocalVariance};
 use crate::ekf::keyframe_update::{
     KeyframeUpdate, LinearizationPoint, Observed, RegistrationReport, SensorModel, Stamp,
 };
+use crate::ekf::line_map::LineMap;
 use crate::geometry::line_noise::LineNoise;
 use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covariance};
 use crate::geometry::segment::Segment;
@@ -325,9 +326,9 @@ impl Estimator {
 
     /// Forgets a line of the map.
     pub fn forget_line<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) {
-        map.forget(index);
-        if let Some(filter) = &mut self.filter {
-            filter.line_removed(index, map.segments().len());
+        match &mut self.filter {
+            Some(filter) => LineMap { map, filter }.remove(index),
+            None => map.forget(index),
         }
     }
 

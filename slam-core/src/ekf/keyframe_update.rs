@@ -12,6 +12,7 @@ use nalgebra::{Isometry2, Point2, Vector3};
 use crate::config::SlamConfig;
 use crate::ekf::config::EkfConfig;
 use crate::ekf::filter::EkfSlam;
+use crate::ekf::line_map::LineMap;
 use crate::ekf::measurement::Measurement;
 use crate::ekf::merging::merge_walls;
 use crate::ekf::state::UpdateScope;
@@ -308,10 +309,7 @@ fn add_unknown<const N: usize>(
         let [var_offset, var_direction] =
             seen.sensor.line_noise.added_to(variances(segment), segment.length_m());
         let segment = with_variances(&segment.transformed(&at.pose), var_offset, var_direction);
-        if segment.is_finite()
-            && let Some(index) = map.insert(segment, seen.stamp.scan, seen.stamp.way_m)
-        {
-            filter.line_replaced(index);
+        if segment.is_finite() && (LineMap { map, filter }).insert(segment, &seen.stamp).is_some() {
             new += 1;
         }
     }

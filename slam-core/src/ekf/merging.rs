@@ -8,6 +8,7 @@ use nalgebra::{Isometry2, Matrix3, Point2};
 use crate::ekf::config::EkfConfig;
 use crate::ekf::filter::EkfSlam;
 use crate::ekf::keyframe_update::SensorModel;
+use crate::ekf::line_map::LineMap;
 use crate::ekf::measurement::Measurement;
 use crate::ekf::state::UpdateScope;
 use crate::geometry::line_noise::LineNoise;
@@ -54,11 +55,8 @@ pub(super) fn merge_walls<const N: usize>(
         if let Some(updated) = update_by_twins([kept, gone], sensor, config, pose, filter, map) {
             *pose = updated;
         }
-        map.fuse(kept, gone);
-        let last = map.segments().len();
-        filter.line_removed(gone, last);
         // The merged line is looked at again, wherever it went.
-        let merged = if kept == last { gone } else { kept };
+        let merged = LineMap { map, filter }.merge(kept, gone);
         near.gather(map.segments(), pose, sensor.reach_m, |_| true);
         let all = near.all();
         next = all.iter().position(|i| usize::from(*i) >= merged).unwrap_or(all.len());

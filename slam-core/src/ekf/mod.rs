@@ -13,6 +13,7 @@
 //! | [`filter`] | the filter, prediction, injection of the error state |
 //! | `update`, `deferred` | measurement update, with its covariance downdate put off |
 //! | `slots` | which line has which states; augmentation |
+//! | `line_map` | map and slots, changed at once |
 //! | [`keyframe`] | which scans the filter sees |
 //! | [`keyframe_update`], `merging` | the update of a keyframe, spread over scans; lines that are one wall |
 //! | [`config`] | settings |
@@ -26,6 +27,7 @@ mod deferred;
 pub mod filter;
 pub mod keyframe;
 pub mod keyframe_update;
+pub(crate) mod line_map;
 mod measurement;
 mod merging;
 mod packed;

@@ -215,14 +215,14 @@ impl EkfSlam {
     }
 
     /// The map has given the index of a line to another one.
-    pub(crate) fn line_replaced(&mut self, index: usize) {
+    pub(super) fn line_replaced(&mut self, index: usize) {
         if let Some(slot) = self.slot_of(index) {
             self.drop_slot(slot);
         }
     }
 
     /// The map's line `gone` is no more, and the one at `last` has taken its index.
-    pub(crate) fn line_removed(&mut self, gone: usize, last: usize) {
+    pub(super) fn line_removed(&mut self, gone: usize, last: usize) {
         self.line_replaced(gone);
         if let Some(id) = self.slot_of(last).and_then(|slot| self.slots.line_ids.get_mut(slot)) {
             *id = LineId::of(gone);

@@ -29,8 +29,8 @@ fn observed<'a>(segments: &'a [Segment], pairs: &'a [Pair], scan: u32) -> Observ
 }
 
 /// A robot that stands at the origin and is sure of it.
-fn run(
-    map: &mut SegmentMap<8>,
+fn run<const N: usize>(
+    map: &mut SegmentMap<N>,
     filter: &mut EkfSlam,
     segments: &[Segment],
     pairs: &[Pair],
@@ -66,7 +66,7 @@ fn unmatched_segments_are_added_and_matched_ones_joined() {
     let once = register_end_points(&observed(&first, &[], 1), &here, &config, &mut map);
     let twice = register_end_points(&observed(&second, &pairs, 2), &here, &config, &mut map);
     check(&map, [once, twice]);
-    let (mut map, mut filter) = (SegmentMap::new(), filter());
+    let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
     let once = run(&mut map, &mut filter, &first, &[], 1);
     let twice = run(&mut map, &mut filter, &second, &pairs, 2);
     check(&map, [once, twice]);
@@ -74,7 +74,7 @@ fn unmatched_segments_are_added_and_matched_ones_joined() {
 
 #[test]
 fn one_wall_seen_in_pieces_becomes_one_segment() {
-    let (mut map, mut filter) = (SegmentMap::new(), filter());
+    let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
     let pieces = [wall((0.0, 1.0), (1.0, 1.0)), wall((2.5, 1.002), (3.5, 1.0)), wall((7.0, 1.0), (8.0, 1.0))];
     run(&mut map, &mut filter, &pieces, &[], 1);
     assert_eq!(map.segments().len(), 3);
@@ -98,7 +98,7 @@ struct Keyframe {
 impl Keyframe {
     /// The robot is at `truth`, believes in the origin, and has found `tracked`.
     fn new(truth: f32, tracked: f32) -> Self {
-        let (mut map, mut filter) = (SegmentMap::new(), filter());
+        let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
         let known = [
             wall((3.0, -2.0), (3.0, 2.0)),
             wall((-3.0, 2.0), (3.0, 2.0)),
@@ -166,16 +166,14 @@ fn a_line_forgotten_before_it_is_taken_in_says_nothing() {
     let (mut whole, mut less) = (Keyframe::new(0.03, 0.03), Keyframe::new(0.03, 0.03));
     // Of the only walls that tell how far ahead the robot is.
     for index in [2, 0] {
-        less.map.forget(index);
-        let last = less.map.segments().len();
-        less.filter.line_removed(index, last);
+        LineMap { map: &mut less.map, filter: &mut less.filter }.remove(index);
     }
     assert!((whole.commit().translation.vector.x - 0.03).abs() < 2e-3);
     assert!(less.commit().translation.vector.x.abs() < 2e-3);
 }
 
 fn registered(walls: &[Segment]) -> SegmentMap<8> {
-    let (mut map, mut filter) = (SegmentMap::new(), filter());
+    let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
     run(&mut map, &mut filter, walls, &[], 1);
     map
 }
@@ -202,7 +200,7 @@ fn walls_that_differ_stay_apart() {
 
 #[test]
 fn a_pair_that_does_not_fit_changes_nothing() {
-    let (mut map, mut filter) = (SegmentMap::new(), filter());
+    let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
     run(&mut map, &mut filter, &[wall((0.0, 1.0), (2.0, 1.0))], &[], 1);
     let before = map.segments()[0].segment;
     let pairs = [Pair { observed: 0, mapped: 0 }];
@@ -211,4 +209,57 @@ fn a_pair_that_does_not_fit_changes_nothing() {
     let after = map.segments()[0].segment;
     assert_eq!((after.start, after.end, after.direction), (before.start, before.end, before.direction));
     assert_eq!(map.segments()[0].hits, 1);
+}
+
+/// A robot that is three centimetres off sees a fifth wall, and with the next keyframe the four that it knows and two new ones: the
+/// fifth is in the state, and as far off as the robot was. Returns map, filter, the new walls as they were seen and the pose at the
+/// commit.
+fn five_walls_and_two<const N: usize>() -> (SegmentMap<N>, EkfSlam, [Segment; 2], Isometry2<f32>) {
+    let (mut map, mut filter) = (SegmentMap::<N>::new(), filter());
+    let known = [
+        wall((3.0, -2.0), (3.0, 2.0)),
+        wall((-3.0, 2.0), (3.0, 2.0)),
+        wall((-3.0, -2.0), (-3.0, 2.0)),
+        wall((-3.0, -2.0), (3.0, -2.0)),
+    ];
+    run(&mut map, &mut filter, &known, &[], 1);
+    filter.inflate_pose(&(Matrix3::identity() * 1e-3), &mut map);
+    let base_from_map = pose(0.03, 0.0, 0.0).inverse();
+    run(&mut map, &mut filter, &[wall((-1.0, 1.0), (-1.0, 1.5)).transformed(&base_from_map)], &[], 2);
+    let unknown = [wall((2.0, -1.0), (2.0, -0.5)), wall((1.0, -1.5), (1.5, -1.0))];
+    let seen: StdVec<Segment> = known.iter().chain(&unknown).map(|s| s.transformed(&base_from_map)).collect();
+    let pairs: StdVec<Pair> = (0..4).map(|i| Pair { observed: i, mapped: i }).collect();
+    let at = LinearizationPoint { prior: pose(0.0, 0.0, 0.0), pose: pose(0.02, 0.0, 0.0) };
+    let mut update = KeyframeUpdate::default();
+    let report = update.begin(&observed(&seen, &pairs, 3), &at, &config(), &mut filter, &mut map);
+    assert_eq!((report.matched, report.new), (4, 2));
+    update.advance(2, &config(), &mut filter);
+    let [_, committed] =
+        update.commit(&SENSOR, &config(), &mut filter, &mut map, &mut Nearby::new()).unwrap();
+    (map, filter, unknown.map(|s| s.transformed(&base_from_map)), committed)
+}
+
+/// To drop a line is to marginalise it out: everything else is as if there had been room.
+#[test]
+fn a_tracked_line_evicted_between_keyframe_and_commit_gives_its_error_to_nobody() {
+    let (full, filter_full, new, pose_full) = five_walls_and_two::<6>();
+    let (roomy, filter_roomy, _, pose_roomy) = five_walls_and_two::<8>();
+    assert_eq!((full.counters().evicted, roomy.counters().evicted), (1, 0));
+    let fifth = roomy.segments()[4].segment.midpoint().x;
+    assert!((fifth + 1.0).abs() < 3e-3, "it had an error of three centimetres: {fifth}");
+    assert!((components(&pose_full) - components(&pose_roomy)).amax() < 1e-6);
+    let covariance = filter_roomy.pose_covariance();
+    assert!((filter_full.pose_covariance() - covariance).amax() < 1e-4 * covariance.amax());
+    for index in 0..4 {
+        let (a, b) = (&full.segments()[index].segment, &roomy.segments()[index].segment);
+        assert!((a.start - b.start).norm() < 1e-5 && (a.end - b.end).norm() < 1e-5, "{index}");
+    }
+    for seen in new {
+        let lies = full.segments()[4..].iter().any(|entry| {
+            let in_base = entry.segment.transformed(&pose_full.inverse());
+            (in_base.midpoint() - seen.midpoint()).norm() < 1e-3
+        });
+        assert!(lies, "where it was seen: {seen:?}");
+    }
+    assert_eq!((0..6).filter_map(|index| filter_full.slot_of(index)).count(), 6);
 }
