@@ -101,7 +101,7 @@ pub struct Counted {
     pub stages: [u32; Stage::COUNT],
     /// Points of the scan.
     pub points: u32,
-    /// Whether the joint estimate took it in.
+    /// Whether it was a keyframe.
     pub keyframe: bool,
     /// Segments of the map afterwards.
     pub segments: usize,

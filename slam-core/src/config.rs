@@ -2,12 +2,13 @@
 
 use nalgebra::{Isometry2, Vector3};
 
+use crate::ekf::config::{EkfConfig, RegistrationConfig};
 use crate::ekf::keyframe::KeyframeConfig;
-use crate::ekf::registration::{JointConfig, MAX_TAKEN, RegistrationConfig};
+use crate::ekf::keyframe_update::MAX_UPDATES;
 use crate::frontend::deskew::DeskewConfig;
 use crate::frontend::extraction::{ExtractionConfig, SplitConfig};
+use crate::geometry::line_noise::LineNoise;
 use crate::geometry::math::min;
-use crate::geometry::residual::LineNoise;
 use crate::loop_closure::LoopConfig;
 use crate::map::visibility::ForgetConfig;
 use crate::odometry::bias::BiasConfig;
@@ -225,7 +226,7 @@ impl Default for SlamConfig {
                 same_heading_rad: 0.03,
             }),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
-            registration: RegistrationConfig::Joint(JointConfig {
+            registration: RegistrationConfig::Ekf(EkfConfig {
                 keyframes: KeyframeConfig {
                     way_m: 0.15,
                     scans: 10,
@@ -235,22 +236,22 @@ impl Default for SlamConfig {
                     scans_below: 6,
                     way_below_m: 1.6,
                 },
-                max_taken: 12,
-                max_learning: 6,
-                taken_per_scan: 6,
-                least_gain: 0.1,
-                again_factor: 2.0,
-                max_chi2: 60.0,
-                kernel_chi2: 2.0,
-                young_hits: 4,
-                young_scans_per_hit: 2.1,
-                fuse_max_angle_rad: 0.1,
-                fuse_max_distance_m: 0.25,
-                fuse_gap_m: 0.2,
-                fuse_max_gap_m: 1.0,
-                fuse_chi2: 4.0,
-                fuse_sigmas: 16.0,
-                fuse_overlap: 0.5,
+                max_updates: 12,
+                max_full_updates: 6,
+                updates_per_scan: 6,
+                min_information_ratio: 0.1,
+                reactivation_inflation: 2.0,
+                max_nis: 60.0,
+                kernel_nis: 2.0,
+                tentative_hits: 4,
+                tentative_scans_per_hit: 2.1,
+                merge_max_angle_rad: 0.1,
+                merge_max_distance_m: 0.25,
+                merge_gap_m: 0.2,
+                merge_max_gap_m: 1.0,
+                merge_max_nis: 4.0,
+                merge_sigmas: 16.0,
+                merge_overlap: 0.5,
             }),
         };
         BEST
@@ -468,26 +469,29 @@ impl SlamConfig {
             check("forgetting.min_sine", (0.0..=1.0).contains(&c.min_sine))?;
             check("forgetting.scans", c.scans > 0)?;
         }
-        if let RegistrationConfig::Joint(c) = &self.registration {
-            check("registration.joint.max_taken", (1..=MAX_TAKEN).contains(&usize::from(c.max_taken)))?;
-            check("registration.joint.taken_per_scan", c.taken_per_scan > 0)?;
-            not_negative("registration.joint.least_gain", c.least_gain)?;
-            check("registration.joint.again_factor", c.again_factor >= 1.0 && c.again_factor.is_finite())?;
-            positive("registration.joint.max_chi2", c.max_chi2)?;
-            positive("registration.joint.kernel_chi2", c.kernel_chi2)?;
-            positive("registration.joint.keyframes.way_m", c.keyframes.way_m)?;
-            check("registration.joint.keyframes.scans", c.keyframes.scans > 0)?;
-            not_negative("registration.joint.keyframes.spacing_between_m", c.keyframes.spacing_between_m)?;
-            not_negative("registration.joint.keyframes.min_score", c.keyframes.min_score)?;
-            not_negative("registration.joint.keyframes.way_below_m", c.keyframes.way_below_m)?;
-            not_negative("registration.joint.young_scans_per_hit", c.young_scans_per_hit)?;
-            positive("registration.joint.fuse_max_angle_rad", c.fuse_max_angle_rad)?;
-            positive("registration.joint.fuse_max_distance_m", c.fuse_max_distance_m)?;
-            positive("registration.joint.fuse_sigmas", c.fuse_sigmas)?;
-            not_negative("registration.joint.fuse_gap_m", c.fuse_gap_m)?;
-            not_negative("registration.joint.fuse_max_gap_m", c.fuse_max_gap_m)?;
-            positive("registration.joint.fuse_chi2", c.fuse_chi2)?;
-            positive("registration.joint.fuse_overlap", c.fuse_overlap)?;
+        if let RegistrationConfig::Ekf(c) = &self.registration {
+            check("registration.ekf.max_updates", (1..=MAX_UPDATES).contains(&usize::from(c.max_updates)))?;
+            check("registration.ekf.updates_per_scan", c.updates_per_scan > 0)?;
+            not_negative("registration.ekf.min_information_ratio", c.min_information_ratio)?;
+            check(
+                "registration.ekf.reactivation_inflation",
+                c.reactivation_inflation >= 1.0 && c.reactivation_inflation.is_finite(),
+            )?;
+            positive("registration.ekf.max_nis", c.max_nis)?;
+            positive("registration.ekf.kernel_nis", c.kernel_nis)?;
+            positive("registration.ekf.keyframes.way_m", c.keyframes.way_m)?;
+            check("registration.ekf.keyframes.scans", c.keyframes.scans > 0)?;
+            not_negative("registration.ekf.keyframes.spacing_between_m", c.keyframes.spacing_between_m)?;
+            not_negative("registration.ekf.keyframes.min_score", c.keyframes.min_score)?;
+            not_negative("registration.ekf.keyframes.way_below_m", c.keyframes.way_below_m)?;
+            not_negative("registration.ekf.tentative_scans_per_hit", c.tentative_scans_per_hit)?;
+            positive("registration.ekf.merge_max_angle_rad", c.merge_max_angle_rad)?;
+            positive("registration.ekf.merge_max_distance_m", c.merge_max_distance_m)?;
+            positive("registration.ekf.merge_sigmas", c.merge_sigmas)?;
+            not_negative("registration.ekf.merge_gap_m", c.merge_gap_m)?;
+            not_negative("registration.ekf.merge_max_gap_m", c.merge_max_gap_m)?;
+            positive("registration.ekf.merge_max_nis", c.merge_max_nis)?;
+            positive("registration.ekf.merge_overlap", c.merge_overlap)?;
         }
         Ok(())
     }

@@ -4,20 +4,22 @@
 //! its covariance, and a map that is moved with it.
 //!
 //! Scan by scan the pose is tracked among lines that stand still; the local covariance is its own error among them. Of
-//! [`keyframe`](crate::ekf::keyframe)s an extended Kalman filter, the [`Joint`] estimate, takes in what was seen, a few sightings with
+//! [`keyframe`](crate::ekf::keyframe)s an extended Kalman filter, [`EkfSlam`], takes in what was seen, a few lines with
 //! each scan, and gathers in its error state what they say of pose, odometry and lines. [`Estimator::commit`] injects the error
 //! state: pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
 
 use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::SlamConfig;
-use crate::ekf::joint::Joint;
-use crate::ekf::keyframe::{AmongLines, Keyframe, KeyframeConfig, Settled};
-use crate::ekf::registration::{
-    Eye, JointConfig, Observed, RegistrationConfig, RegistrationReport, Sightings, Stamp, Start,
+use crate::ekf::config::{EkfConfig, RegistrationConfig};
+use crate::ekf::filter::EkfSlam;
+use crate::ekf::keyframe::{Anchor, Keyframe, KeyframeConfig, LocalVariance};
+use crate::ekf::keyframe_update::{
+    KeyframeUpdate, LinearizationPoint, Observed, RegistrationReport, SensorModel, Stamp,
 };
+use crate::ekf::line_map::LineMap;
+use crate::geometry::line_noise::LineNoise;
 use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covariance};
-use crate::geometry::residual::LineNoise;
 use crate::geometry::segment::Segment;
 use crate::loop_closure::Closure;
 use crate::map::SegmentMap;
@@ -52,13 +54,13 @@ pub(crate) struct Estimator {
     /// Of the pose among the lines around it; what they have in common with it is the filter's.
     local_covariance: Matrix3<f32>,
     /// The filter; none with the paper's registration.
-    joint: Option<Joint>,
+    filter: Option<EkfSlam>,
     /// Where the filter stands, and the odometry since.
     keyframe: Keyframe,
-    /// Of the keyframe, on their way into the filter.
-    sightings: Sightings,
-    /// Where the filter's error state was injected last, and how sure it was of the pose then.
-    settled: Settled,
+    /// Of the filter by the keyframe, spread over scans.
+    update: KeyframeUpdate,
+    /// Where the filter's error state was injected last, with the pose's covariance.
+    anchor: Anchor,
     /// Scans before the one at hand.
     scans: u32,
     travelled_m: f32,
@@ -80,10 +82,10 @@ impl Estimator {
         Self {
             map_from_base: Isometry2::identity(),
             local_covariance: Matrix3::zeros(),
-            joint: Some(Joint::blank()),
-            keyframe: Keyframe::at(Isometry2::identity(), AmongLines::default()),
-            sightings: Sightings::default(),
-            settled: Settled::default(),
+            filter: Some(EkfSlam::blank()),
+            keyframe: Keyframe::at(Isometry2::identity(), LocalVariance::default()),
+            update: KeyframeUpdate::default(),
+            anchor: Anchor::default(),
             scans: 0,
             travelled_m: 0.0,
         }
@@ -91,11 +93,11 @@ impl Estimator {
 
     /// Prepares the filter where the configuration asks for one, and drops it where not.
     pub fn prepare(&mut self, config: &SlamConfig) {
-        match &mut self.joint {
-            Some(joint) if config.registration.joint().is_some() => {
-                joint.prepare(config.odometry.bias_sigmas())
+        match &mut self.filter {
+            Some(filter) if config.registration.ekf().is_some() => {
+                filter.prepare(config.odometry.bias_sigmas())
             }
-            joint => *joint = None,
+            filter => *filter = None,
         }
     }
 
@@ -111,24 +113,24 @@ impl Estimator {
 
     /// Covariance of the pose (x, y, θ), in `map`, the error of the lines around it included.
     pub fn covariance(&self, line_noise: &LineNoise) -> Matrix3<f32> {
-        if self.joint.is_none() {
+        if self.filter.is_none() {
             return self.local_covariance;
         }
         // What the walls that were seen have in common does not average out over many of them.
         let in_common = line_noise.var_offset();
-        self.settled.carried(&self.map_from_base)
-            + self.settled.grown(&self.local_covariance)
+        self.anchor.carried(&self.map_from_base)
+            + self.anchor.grown(&self.local_covariance)
             + Matrix3::from_diagonal(&Vector3::new(in_common, in_common, 0.0))
     }
 
     /// Covariance of the keyframe's pose by the filter, if there is one.
     pub fn filter_covariance(&self) -> Option<Matrix3<f32>> {
-        self.joint.as_ref().map(Joint::pose_covariance)
+        self.filter.as_ref().map(EkfSlam::pose_covariance)
     }
 
     /// Systematic errors of the odometry as learnt so far.
     pub fn odometry_bias(&self) -> OdometryBias {
-        self.joint.as_ref().map_or_else(OdometryBias::default, Joint::bias)
+        self.filter.as_ref().map_or_else(OdometryBias::default, EkfSlam::bias)
     }
 
     /// Way driven until now, metres.
@@ -176,7 +178,7 @@ impl Estimator {
         let is_usable = self.predict(&ScanMotion::instantaneous(*motion), around);
         if self.keyframe_is_due(&around.config.registration) {
             self.advance(around);
-            self.note_settled();
+            self.set_anchor();
         }
         is_usable
     }
@@ -195,11 +197,11 @@ impl Estimator {
     /// The same of the filter's pose only: that of the scan at hand is known from the scan.
     fn inflate_filter<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) {
         self.commit(around);
-        if let Some(joint) = &mut self.joint {
-            joint.loosen_pose(by, around.map);
+        if let Some(filter) = &mut self.filter {
+            filter.inflate_pose(by, around.map);
         }
-        self.keyframe.among_lines = self.keyframe.among_lines.plus(by);
-        self.note_settled();
+        self.keyframe.local_variance = self.keyframe.local_variance.plus(by);
+        self.set_anchor();
     }
 
     /// The filter goes on from where a scan says that overruled the prediction, so much less sure (covariance of (x, y, θ)): what
@@ -210,31 +212,31 @@ impl Estimator {
         self.keyframe.since.before_from_after = normalized(&moved);
     }
 
-    /// Takes in what is left of the last keyframe's sightings and injects the error state: pose and lines move at once, and lines
-    /// that turn out to be one wall are fused. Without sightings nothing happens.
+    /// Completes the keyframe's update and injects the error state: pose and lines move at once, and lines that turn out to be one
+    /// wall are merged. Without a pending update nothing happens.
     pub fn commit<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) {
-        let Some(config) = around.config.registration.joint() else { return };
-        let Some(joint) = &mut self.joint else { return };
-        let (eye, near) = (Eye::of(around.config), &mut around.tracker.nearby);
-        let Some([before, after]) = self.sightings.settle(&eye, config, joint, around.map, near) else {
+        let Some(config) = around.config.registration.ekf() else { return };
+        let Some(filter) = &mut self.filter else { return };
+        let (sensor, near) = (SensorModel::of(around.config), &mut around.tracker.nearby);
+        let Some([before, after]) = self.update.commit(&sensor, config, filter, around.map, near) else {
             return;
         };
-        // Fusing has renumbered the map's segments.
+        // Merging has renumbered the map's segments.
         around.tracker.forget_shortlist();
         self.keyframe.map_from_base = after;
-        self.note_settled();
+        self.set_anchor();
         self.map_from_base = after * before.inverse() * self.map_from_base;
     }
 
     /// Whether the scan at hand is to be taken into the map.
     pub fn keyframe_is_due(&self, config: &RegistrationConfig) -> bool {
-        config.joint().is_none_or(|config| self.keyframe.is_due(self.scans, &config.keyframes))
+        config.ekf().is_none_or(|config| self.keyframe.is_due(self.scans, &config.keyframes))
     }
 
     /// How close to each other the points of the scan at hand need not be, metres.
     pub fn spacing_m(&self, config: &RegistrationConfig) -> f32 {
-        match config.joint() {
-            Some(joint) if !self.keyframe_is_due(config) => joint.keyframes.spacing_between_m,
+        match config.ekf() {
+            Some(ekf) if !self.keyframe_is_due(config) => ekf.keyframes.spacing_between_m,
             _ => 0.0,
         }
     }
@@ -249,15 +251,15 @@ impl Estimator {
         match &config.registration {
             RegistrationConfig::EndPoints(end_points) => {
                 let (segments, pairs) = (around.observed, &*around.tracker.pairs);
-                let seen = Observed { segments, pairs, stamp: self.stamp(), eye: Eye::of(config) };
+                let seen = Observed { segments, pairs, stamp: self.stamp(), sensor: SensorModel::of(config) };
                 register_end_points(&seen, &self.map_from_base, end_points, around.map)
             }
-            RegistrationConfig::Joint(joint) => {
+            RegistrationConfig::Ekf(ekf) => {
                 let is_due = self.keyframe_is_due(&config.registration);
-                if update.closure.is_some() || is_due && self.admits(update, &joint.keyframes, around) {
-                    self.take_keyframe(update.closure.as_ref(), joint, around)
+                if update.closure.is_some() || is_due && self.admits(update, &ekf.keyframes, around) {
+                    self.take_keyframe(update.closure.as_ref(), ekf, around)
                 } else {
-                    self.go_on_with_keyframe(joint, around)
+                    self.go_on_with_keyframe(ekf, around)
                 }
             }
         }
@@ -277,12 +279,12 @@ impl Estimator {
         update.state != TrackingState::Lost && (update.support >= config.min_score || waited || at_start)
     }
 
-    /// Makes the scan at hand the keyframe. Its sightings are taken in from the next scan on, unless keyframes follow each other or a
-    /// loop was closed.
+    /// Makes the scan at hand the keyframe. The filter is updated from the next scan on; at once where keyframes follow each other or
+    /// a loop was closed.
     fn take_keyframe<const N: usize>(
         &mut self,
         closure: Option<&Closure>,
-        config: &JointConfig,
+        config: &EkfConfig,
         around: &mut Surroundings<'_, N>,
     ) -> RegistrationReport {
         let in_a_row = self.keyframe.scans <= 1;
@@ -290,43 +292,43 @@ impl Estimator {
         // A closed loop has moved the prediction with the map.
         let carried = closure.map(|closure| closure.closed * closure.drifted.inverse());
         let prior = carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced);
-        self.keyframe = Keyframe::at(prior, AmongLines::of(&self.local_covariance));
-        let start = Start { prior: &prior, pose: &self.map_from_base };
+        self.keyframe = Keyframe::at(prior, LocalVariance::of(&self.local_covariance));
+        let at = LinearizationPoint { prior, pose: self.map_from_base };
         let seen = Observed {
             segments: around.observed,
             pairs: &around.tracker.pairs,
             stamp: self.stamp(),
-            eye: Eye::of(around.config),
+            sensor: SensorModel::of(around.config),
         };
-        let Some(joint) = &mut self.joint else { return RegistrationReport::default() };
-        let mut report = self.sightings.make(&seen, &start, config, joint, around.map);
+        let Some(filter) = &mut self.filter else { return RegistrationReport::default() };
+        let mut report = self.update.begin(&seen, &at, config, filter, around.map);
         if in_a_row || closure.is_some() {
             self.commit(around);
-            report.settled = true;
+            report.committed = true;
         }
         report
     }
 
-    /// Takes in some sightings of the keyframe; once all are in, the error state is injected.
+    /// Updates the filter by some more measurements of the keyframe; after the last one the error state is injected.
     fn go_on_with_keyframe<const N: usize>(
         &mut self,
-        config: &JointConfig,
+        config: &EkfConfig,
         around: &mut Surroundings<'_, N>,
     ) -> RegistrationReport {
         let mut report = RegistrationReport::default();
-        let Some(joint) = self.joint.as_mut().filter(|_| self.sightings.wait()) else { return report };
-        if !self.sightings.take_in(config.taken_per_scan.into(), config, joint) {
+        let Some(filter) = self.filter.as_mut().filter(|_| self.update.is_pending()) else { return report };
+        if !self.update.advance(config.updates_per_scan.into(), config, filter) {
             self.commit(around);
-            report.settled = true;
+            report.committed = true;
         }
         report
     }
 
     /// Forgets a line of the map.
     pub fn forget_line<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) {
-        map.forget(index);
-        if let Some(joint) = &mut self.joint {
-            joint.removed(index, map.segments().len(), map);
+        match &mut self.filter {
+            Some(filter) => LineMap { map, filter }.remove(index),
+            None => map.forget(index),
         }
     }
 
@@ -339,12 +341,12 @@ impl Estimator {
 
     /// Begins anew from where the robot stands. Of the filter only the odometry's errors stay.
     pub fn begin_anew(&mut self, config: &SlamConfig) {
-        if let Some(joint) = &mut self.joint {
-            joint.clear(config.odometry.bias_sigmas());
+        if let Some(filter) = &mut self.filter {
+            filter.clear(config.odometry.bias_sigmas());
         }
-        self.sightings.clear();
-        self.keyframe = Keyframe::at(self.map_from_base, AmongLines::default());
-        self.note_settled();
+        self.update.clear();
+        self.keyframe = Keyframe::at(self.map_from_base, LocalVariance::default());
+        self.set_anchor();
     }
 
     /// Puts the pose in order after a reset that may have come while it was written. False where it is lost.
@@ -360,14 +362,13 @@ impl Estimator {
     fn advance<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) -> Isometry2<f32> {
         let last = self.keyframe;
         let moved = self.moved(&last.map_from_base, &last.since, around);
-        if let Some(joint) = &mut self.joint {
-            let turn = last.map_from_base.rotation.to_rotation_matrix().to_homogeneous();
-            let by_odometry = turn * OdometryBias::derivative(&last.since);
-            joint.predict(&moved.by_pose, &by_odometry, &moved.noise, around.map);
+        if let Some(filter) = &mut self.filter {
+            let by_odometry = by_odometry(&last.map_from_base, &last.since);
+            filter.predict(&moved.by_pose, &by_odometry, &moved.noise, around.map);
         }
         // Of no scan yet: the pose may have been corrected since.
-        let among_lines = AmongLines::of(&self.local_covariance);
-        self.keyframe = Keyframe { scans: 1, ..Keyframe::at(moved.pose, among_lines) };
+        let local_variance = LocalVariance::of(&self.local_covariance);
+        self.keyframe = Keyframe { scans: 1, ..Keyframe::at(moved.pose, local_variance) };
         moved.pose
     }
 
@@ -387,20 +388,26 @@ impl Estimator {
         Moved { pose, by_pose, noise: rotate_covariance(from, &noise) }
     }
 
-    /// The filter stands at the keyframe, with nothing left to be taken in.
-    fn note_settled(&mut self) {
-        if let Some(joint) = &self.joint {
+    /// Poses are relative to the keyframe from now on, where the filter stands with no update pending.
+    fn set_anchor(&mut self) {
+        if let Some(filter) = &self.filter {
             let position = self.keyframe.map_from_base.translation.vector;
-            let covariance = joint.pose_covariance();
-            self.settled = Settled { position, covariance, among_lines: self.keyframe.among_lines };
+            let covariance = filter.pose_covariance();
+            self.anchor = Anchor { position, covariance, local_variance: self.keyframe.local_variance };
         }
     }
+}
+
+/// Jacobian of the pose that an increment leads to, in `map`, by the odometry's errors.
+fn by_odometry(from: &Isometry2<f32>, increment: &Increment) -> Matrix3<f32> {
+    let turn = from.rotation.to_rotation_matrix().to_homogeneous();
+    turn * OdometryBias::derivative(increment)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::{components, difference, pose};
+    use crate::geometry::pose::{components, difference, exp, pose};
     use nalgebra::Point2;
 
     /// All that an estimator works with, around a robot that has seen nothing.
@@ -461,6 +468,32 @@ mod tests {
                 let step = Vector3::ith(k, h);
                 let slope = difference(&at(step).pose, &at(-step).pose) / (2.0 * h);
                 assert!((slope - by_pose.column(k)).norm() < 1e-3, "{k}: {slope} {by_pose}");
+            }
+        }
+    }
+
+    /// Over the way between keyframes. The Jacobian takes a turn as spread over the way, which is off by a twelfth of its square.
+    #[test]
+    fn the_motion_s_jacobian_by_the_odometry_s_errors_is_the_finite_difference() {
+        let mut robot = Robot::new(SlamConfig::default());
+        let (estimator, around) = robot.with(&[]);
+        let motions = [(0.15, 0.0), (-0.15, 0.1), (0.1, -0.15), (0.0, 0.2), (0.15, 0.15)];
+        for (forward, turn) in motions {
+            let increment = Increment::from_motion(exp(&Vector3::new(forward, 0.0, turn)));
+            for heading in [0.0, 0.7, -2.0, 3.1] {
+                let from = pose(1.0, -0.5, heading);
+                let jacobian = by_odometry(&from, &increment);
+                let h = 0.05;
+                for k in 0..3 {
+                    let mut at = |error: f32| {
+                        let bias = OdometryBias(Vector3::ith(k, error));
+                        estimator.filter.as_mut().unwrap().set_bias(bias);
+                        estimator.moved(&from, &increment, &around).pose
+                    };
+                    let slope = difference(&at(h), &at(-h)) / (2.0 * h);
+                    let off = slope - jacobian.column(k);
+                    assert!(off.norm() < 3e-4, "{k} of {forward} {turn}: {slope} {jacobian}");
+                }
             }
         }
     }

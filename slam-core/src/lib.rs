@@ -9,7 +9,7 @@
 //!
 //! ```text
 //!  ranges_mm ──► frontend ──────────► tracking ◄─► loop closure ──► registration ──► map
-//!                deskew, extraction   association,                  ekf: Joint        │
+//!                deskew, extraction   association,                  ekf: EkfSlam      │
 //!                  ▲     [Segment]    correction, [Pair]             ▲ │          forgetting
 //!                  │                  heading search                 │ │              │
 //!  ticks ──► odometry ──► predict ───────┴──► pose ──────────────────┘ │              │
@@ -22,7 +22,7 @@
 //! odometry, judge the state, register, forget. Each stage is a folder of its own and can be used without it.
 //!
 //! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are
-//! [`keyframe`](ekf::keyframe)s the joint estimate then has the last word on the pose, on the odometry's errors and on the lines,
+//! [`keyframe`](ekf::keyframe)s the filter then has the last word on the pose, on the odometry's errors and on the lines,
 //! a few scans later.
 //!
 //! # Frames and units

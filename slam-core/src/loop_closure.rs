@@ -34,7 +34,7 @@ pub struct LoopConfig {
     pub min_support: f32,
     /// χ² of the correction, by the pose's own covariance, from which the robot counts as having drifted.
     pub min_chi2: f32,
-    /// χ² of the correction, by the joint estimate's covariance of the pose, up to which it is believed.
+    /// χ² of the correction, by the filter's covariance of the pose, up to which it is believed.
     pub max_chi2: f32,
     /// Consecutive scans that must ask for the same correction.
     pub confirmations: u8,

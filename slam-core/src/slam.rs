@@ -95,7 +95,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     }
 
     /// Puts in order what a reset in the middle of [`Self::process_scan`] may have left half done. Segments that are not finite leave
-    /// the map, and the joint estimate begins anew with what the map says. False where the pose is lost: nothing can be
+    /// the map, and the filter begins anew with what the map says. False where the pose is lost: nothing can be
     /// kept then.
     pub fn recover(&mut self) -> bool {
         if !self.estimator.recover_pose() {

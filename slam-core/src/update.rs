@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry2, Matrix3};
 
-use crate::ekf::registration::RegistrationReport;
+use crate::ekf::keyframe_update::RegistrationReport;
 use crate::frontend::deskew::DeskewReport;
 use crate::frontend::extraction::ExtractionReport;
 use crate::loop_closure::Closure;

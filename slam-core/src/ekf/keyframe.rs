@@ -1,10 +1,9 @@
-//! Which scans the map is built from.
+//! Which scans the filter sees.
 //!
-//! Scans taken from nearly the same place share errors: corners cut alike, edges mixed alike. Taking in each of them would
-//! make the map sure of what they have in common, and would cost the most work where there is least to learn. So the
-//! joint estimate takes in a scan when the robot has moved on since the last one it took in, and now and then while it
-//! stands. The pose of every other scan is corrected against the map as the last keyframe left it, by fewer beams; and
-//! while the robot goes on, what the keyframe saw is taken in bit by bit, so that no scan takes long.
+//! Scans taken from nearly the same place share errors: corners cut alike, edges mixed alike. To take them for independent would make
+//! the filter overconfident, and would cost most where there is least to learn. So a scan becomes a keyframe when the robot has moved
+//! on since the last one, and now and then while it stands. The pose of every other scan is tracked against the map as the last
+//! keyframe left it, by fewer beams; meanwhile the keyframe's update is spread over scans, so that none takes long.
 
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
@@ -37,20 +36,20 @@ pub struct KeyframeConfig {
 /// The last keyframe and the way since.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Keyframe {
-    /// Pose of `base` in `map` by the joint estimate.
+    /// Pose of `base` in `map` by the filter.
     pub map_from_base: Isometry2<f32>,
     /// What the odometry said since, its systematic errors included.
     pub since: Increment,
     /// Scans since.
     pub scans: u32,
-    /// Its own error among the lines around it.
-    pub among_lines: AmongLines,
+    /// Its variance relative to the lines around it.
+    pub local_variance: LocalVariance,
 }
 
 impl Keyframe {
     /// A keyframe just taken.
-    pub fn at(map_from_base: Isometry2<f32>, among_lines: AmongLines) -> Self {
-        Self { map_from_base, since: Increment::identity(), scans: 0, among_lines }
+    pub fn at(map_from_base: Isometry2<f32>, local_variance: LocalVariance) -> Self {
+        Self { map_from_base, since: Increment::identity(), scans: 0, local_variance }
     }
 
     /// Whether the robot has gone on far enough for another one; `number` is that of the scan.
@@ -61,40 +60,40 @@ impl Keyframe {
     }
 }
 
-/// Where the joint estimate last stood with nothing left to be taken in.
+/// The filter's pose at its last commit, with no update pending: poses until the next one are relative to it.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Settled {
+pub(crate) struct Anchor {
     /// Of `base` in `map`.
     pub position: Vector2<f32>,
     /// Of the pose (x, y, θ).
     pub covariance: Matrix3<f32>,
-    /// What of that is the pose's own error among the lines around it.
-    pub among_lines: AmongLines,
+    /// What of that is the pose's variance relative to the lines around it.
+    pub local_variance: LocalVariance,
 }
 
-/// Variances of a pose if the lines around it had none.
+/// Variances of a pose relative to the lines around it, as if these were known for certain.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct AmongLines {
+pub(crate) struct LocalVariance {
     /// Of both coordinates, summed.
     position: f32,
     heading: f32,
 }
 
-impl AmongLines {
-    /// From the covariance (x, y, θ).
+impl LocalVariance {
+    /// Of a covariance (x, y, θ).
     pub fn of(covariance: &Matrix3<f32>) -> Self {
         Self { position: covariance.m11 + covariance.m22, heading: covariance.m33 }
     }
 
-    /// With another covariance on top.
+    /// With another covariance added.
     pub fn plus(self, covariance: &Matrix3<f32>) -> Self {
         let by = Self::of(covariance);
         Self { position: self.position + by.position, heading: self.heading + by.heading }
     }
 }
 
-impl Settled {
-    /// Covariance of a pose that lies firmly with that one.
+impl Anchor {
+    /// Covariance of a pose that is rigidly attached to the anchor: J·P·Jᵀ.
     pub fn carried(&self, map_from_base: &Isometry2<f32>) -> Matrix3<f32> {
         let lever = perpendicular(map_from_base.translation.vector - self.position);
         let mut by_pose = Matrix3::identity();
@@ -102,11 +101,11 @@ impl Settled {
         by_pose * self.covariance * by_pose.transpose()
     }
 
-    /// What a pose's own error among the lines around it, of such a covariance, adds to what is carried: by how much it is
-    /// more than it was here.
+    /// What a pose's covariance relative to the lines around it adds to that: its growth since the anchor, which has its own in it
+    /// already.
     pub fn grown(&self, covariance: &Matrix3<f32>) -> Matrix3<f32> {
         let share = |before: f32, now: f32| if now > before { sqrt(1.0 - before / now) } else { 0.0 };
-        let (before, now) = (self.among_lines, AmongLines::of(covariance));
+        let (before, now) = (self.local_variance, LocalVariance::of(covariance));
         let position = share(before.position, now.position);
         let heading = share(before.heading, now.heading);
         let shares = Matrix3::from_diagonal(&Vector3::new(position, position, heading));
@@ -131,7 +130,7 @@ mod tests {
 
     #[test]
     fn it_is_due_at_the_start_after_a_way_after_a_turn_and_after_a_while() {
-        let mut last = Keyframe::at(Isometry2::identity(), AmongLines::default());
+        let mut last = Keyframe::at(Isometry2::identity(), LocalVariance::default());
         assert!(last.is_due(0, &CONFIG) && last.is_due(1, &CONFIG) && !last.is_due(2, &CONFIG));
         // Back and forth is a way too.
         for step in [0.06, -0.06] {
@@ -139,18 +138,18 @@ mod tests {
             last.since = last.since.then(&Increment::from_motion(pose(step, 0.0, 0.0)));
         }
         assert!(last.is_due(9, &CONFIG));
-        last = Keyframe::at(Isometry2::identity(), AmongLines::default());
+        last = Keyframe::at(Isometry2::identity(), LocalVariance::default());
         last.since = Increment::from_motion(pose(0.0, 0.0, -0.11));
         assert!(last.is_due(9, &CONFIG));
-        last = Keyframe { scans: 5, ..Keyframe::at(Isometry2::identity(), AmongLines::default()) };
+        last = Keyframe { scans: 5, ..Keyframe::at(Isometry2::identity(), LocalVariance::default()) };
         assert!(last.is_due(9, &CONFIG));
     }
 
     #[test]
-    fn away_from_where_it_settled_the_heading_s_error_moves_the_robot() {
+    fn away_from_the_anchor_the_heading_s_error_moves_the_robot() {
         let covariance = Matrix3::from_diagonal(&nalgebra::Vector3::new(1e-4, 1e-4, 4e-4));
-        let settled = Settled { position: Vector2::new(1.0, 1.0), covariance, ..Settled::default() };
-        let carried = settled.carried(&pose(3.0, 1.0, 0.0));
+        let anchor = Anchor { position: Vector2::new(1.0, 1.0), covariance, ..Anchor::default() };
+        let carried = anchor.carried(&pose(3.0, 1.0, 0.0));
         assert!((carried.m22 - (1e-4 + 4.0 * 4e-4)).abs() < 1e-8 && (carried.m11 - 1e-4).abs() < 1e-8);
         assert!((carried.m23 - 2.0 * 4e-4).abs() < 1e-8);
     }
@@ -158,10 +157,10 @@ mod tests {
     #[test]
     fn only_what_an_error_has_grown_by_is_added() {
         let before = Matrix3::from_diagonal(&Vector3::new(1e-4, 3e-4, 1e-4));
-        let settled = Settled { among_lines: AmongLines::of(&before), ..Settled::default() };
-        assert_eq!(settled.grown(&before), Matrix3::zeros());
-        assert_eq!(settled.grown(&(before * 0.5)), Matrix3::zeros());
-        let grown = settled.grown(&(before * 4.0));
+        let anchor = Anchor { local_variance: LocalVariance::of(&before), ..Anchor::default() };
+        assert_eq!(anchor.grown(&before), Matrix3::zeros());
+        assert_eq!(anchor.grown(&(before * 0.5)), Matrix3::zeros());
+        let grown = anchor.grown(&(before * 4.0));
         assert!((grown - before * 3.0).amax() < 1e-9, "{grown}");
     }
 }

@@ -6,6 +6,8 @@
 
 use core::f32::consts::PI;
 
+/// Least variance that is kept: beneath it `f32` has no digits left beside the variances of metres and radians.
+pub const VARIANCE_FLOOR: f32 = 1e-12;
 /// Up to this angle, radians, the reduction to one quarter loses no digits.
 const REDUCED_RAD: f32 = 100.0;
 

@@ -2,7 +2,7 @@
 //!
 //! A scan corrects only a part of a prediction's error, so a constant error of the odometry would leave the pose behind
 //! by a constant, and each new wall with it. Three of them are estimated together with the pose, see
-//! [`Joint`](crate::ekf::joint::Joint): a scale of the distance, a scale of the turn, and a turn for each metre (unequal wheels).
+//! [`EkfSlam`](crate::ekf::filter::EkfSlam): a scale of the distance, a scale of the turn, and a turn for each metre (unequal wheels).
 
 use nalgebra::{Matrix3, Vector3};
 

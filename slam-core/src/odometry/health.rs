@@ -6,7 +6,7 @@
 use nalgebra::{Isometry2, Matrix3};
 
 use crate::config::{OdometryConfig, SlamConfig};
-use crate::geometry::residual::LineNoise;
+use crate::geometry::line_noise::LineNoise;
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::monitor::OdometryMonitor;
 use crate::odometry::noise_learning::NoiseLearning;

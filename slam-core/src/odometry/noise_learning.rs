@@ -10,9 +10,9 @@
 
 use nalgebra::{Isometry2, Vector3};
 
+use crate::geometry::line_noise::LineNoise;
 use crate::geometry::math::{max, min, sqrt, within};
 use crate::geometry::pose::{log, normalized};
-use crate::geometry::residual::LineNoise;
 use crate::odometry::{Increment, OdometryNoise};
 
 /// Settings.

@@ -14,7 +14,7 @@
 
 use nalgebra::Isometry2;
 
-use crate::ekf::registration::{Observed, RegistrationReport, mark_seen};
+use crate::ekf::keyframe_update::{Observed, RegistrationReport, mark_seen};
 use crate::geometry::segment::{Moments, Segment};
 use crate::map::SegmentMap;
 
@@ -47,7 +47,7 @@ pub fn register_end_points<const N: usize>(
     config: &EndPointsConfig,
     map: &mut SegmentMap<N>,
 ) -> RegistrationReport {
-    let mut report = RegistrationReport { keyframe: true, settled: true, ..RegistrationReport::default() };
+    let mut report = RegistrationReport { keyframe: true, committed: true, ..RegistrationReport::default() };
     for pair in seen.pairs {
         let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
         else {

@@ -10,9 +10,10 @@ use heapless::{Vec, VecView};
 use nalgebra::{Isometry2, Matrix3, Point2, Vector2};
 
 use crate::frontend::extraction::MAX_SEGMENTS;
+use crate::geometry::line_noise::LineNoise;
+use crate::geometry::line_observation::Residual;
 use crate::geometry::math::{min, sqrt};
 use crate::geometry::pose::cross;
-use crate::geometry::residual::{LineNoise, Residual};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
 use crate::map::nearby::Nearby;

@@ -10,9 +10,10 @@
 
 use nalgebra::{Isometry2, Matrix2, Matrix3, Vector2, Vector3};
 
+use crate::geometry::line_noise::LineNoise;
+use crate::geometry::line_observation::Residual;
 use crate::geometry::math::{max, min, sqrt};
 use crate::geometry::pose::{components, perpendicular, pose};
-use crate::geometry::residual::{LineNoise, Residual};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
 use crate::paper::least_squares::LeastSquaresConfig;
@@ -393,7 +394,10 @@ mod tests {
         let mut gauss = || (0..12).map(|_| rng.next_u32() as f32 / u32::MAX as f32).sum::<f32>() - 6.0;
         let noise = LineNoise { sigma_offset_m: 0.0, sigma_direction_rad: 0.0 };
         let map = entries(
-            &room().iter().map(|s| crate::ekf::joint::with_variances(s, 1e-12, 1e-12)).collect::<Vec<_>>(),
+            &room()
+                .iter()
+                .map(|s| crate::geometry::line_noise::with_variances(s, 1e-12, 1e-12))
+                .collect::<Vec<_>>(),
         );
         let prior = Prior { pose: pose(0.0, 0.0, 0.0), covariance: Matrix3::identity() };
         let config = GaussNewtonConfig { kernel_chi2: 1e9, direction_trust_rad: 0.0, ..config() };

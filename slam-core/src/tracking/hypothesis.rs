@@ -2,8 +2,9 @@
 
 use nalgebra::{Isometry2, Matrix2, Matrix3};
 
+use crate::geometry::line_noise::LineNoise;
+use crate::geometry::line_observation::Residual;
 use crate::geometry::math::{max, within};
-use crate::geometry::residual::{LineNoise, Residual};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
 use crate::tracking::association::Pair;

@@ -1,0 +1,119 @@
+//! Lines of the map that are one wall become one line.
+//!
+//! That two lines are one is a measurement of their difference, with the noise of a line: the filter takes it in, so that pose and
+//! all lines follow; then one takes over the other's extent.
+
+use nalgebra::{Isometry2, Matrix3, Point2};
+
+use crate::ekf::config::EkfConfig;
+use crate::ekf::filter::EkfSlam;
+use crate::ekf::keyframe_update::SensorModel;
+use crate::ekf::line_map::LineMap;
+use crate::ekf::measurement::Measurement;
+use crate::ekf::state::UpdateScope;
+use crate::geometry::line_noise::LineNoise;
+use crate::geometry::line_observation::Residual;
+use crate::geometry::math::{max, min};
+use crate::geometry::pose::cross;
+use crate::geometry::segment::Segment;
+use crate::map::nearby::Nearby;
+use crate::map::{MapSegment, SegmentMap};
+
+/// Merges each line that a scan saw with those that are the same wall. Leaves the lines around the robot in `near`.
+pub(super) fn merge_walls<const N: usize>(
+    scan: u32,
+    sensor: &SensorModel,
+    config: &EkfConfig,
+    pose: &mut Isometry2<f32>,
+    filter: &mut EkfSlam,
+    map: &mut SegmentMap<N>,
+    near: &mut Nearby<N>,
+) {
+    near.gather(map.segments(), pose, sensor.reach_m, |_| true);
+    let mut next = 0;
+    while let Some(index) = near.all().get(next).copied().map(usize::from) {
+        let Some(changed) = map.segments().get(index).copied() else { break };
+        let is_twin = |other: &usize| {
+            *other != index
+                && map.segments().get(*other).is_some_and(|s| {
+                    one_wall(&changed, s, &pose.translation.vector.into(), &sensor.line_noise, config)
+                })
+        };
+        let twin = (changed.last_seen == scan)
+            .then(|| {
+                near.along(changed.segment.direction, config.merge_max_angle_rad)
+                    .map(usize::from)
+                    .find(is_twin)
+            })
+            .flatten();
+        let Some(twin) = twin else {
+            next += 1;
+            continue;
+        };
+        let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment.moments.inliers);
+        let (kept, gone) = if inliers(twin) > inliers(index) { (twin, index) } else { (index, twin) };
+        if let Some(updated) = update_by_twins([kept, gone], sensor, config, pose, filter, map) {
+            *pose = updated;
+        }
+        // The merged line is looked at again, wherever it went.
+        let merged = LineMap { map, filter }.merge(kept, gone);
+        near.gather(map.segments(), pose, sensor.reach_m, |_| true);
+        let all = near.all();
+        next = all.iter().position(|i| usize::from(*i) >= merged).unwrap_or(all.len());
+    }
+}
+
+/// Updates the filter by two lines being one, unless the gate rejects it. Returns the pose by that.
+fn update_by_twins<const N: usize>(
+    twins: [usize; 2],
+    sensor: &SensorModel,
+    config: &EkfConfig,
+    pose: &Isometry2<f32>,
+    filter: &mut EkfSlam,
+    map: &mut SegmentMap<N>,
+) -> Option<Isometry2<f32>> {
+    let [kept, gone] = twins.map(|index| filter.activate(index, config.reactivation_inflation, map));
+    let [a, b] = twins.map(|index| map.segments().get(index).map(|s| s.segment));
+    let (a, b) = (a?, b?);
+    let noise = sensor.line_noise.added_to([0.0, 0.0], min(a.length_m(), b.length_m()));
+    let measurement = Measurement::of_twins((&a, kept?), (&b, gone?), noise);
+    filter.update(&measurement, &config.merge_gate(), UpdateScope::All).then(|| filter.commit(pose, map))
+}
+
+/// Whether two lines are one wall: either they agree within their uncertainty, or they lie so close behind each other that one would
+/// hide the other.
+fn one_wall(
+    a: &MapSegment,
+    b: &MapSegment,
+    position: &Point2<f32>,
+    noise: &LineNoise,
+    config: &EkfConfig,
+) -> bool {
+    let (a, b) = (&a.segment, &b.segment);
+    let facing = a.direction.dot(&b.direction) > 0.0;
+    if !facing || cross(a.direction, b.direction).abs() > config.merge_max_angle_rad {
+        return false;
+    }
+    // The shorter one is judged by the longer one's line.
+    let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
+    let distance = distance_m(long, short);
+    if distance > config.merge_max_distance_m {
+        return false;
+    }
+    let overlap_m = long.overlap_m(short);
+    let hides = overlap_m >= config.merge_overlap * short.length_m()
+        && distance <= config.merge_sigmas * noise.sigma_offset_m;
+    let agrees = || {
+        Residual::new(short, long, *position, noise)
+            .is_some_and(|r| r.chi2(&Matrix3::zeros()) <= config.merge_max_nis)
+    };
+    // A long wall goes on behind a door; a short thing beside another is another thing.
+    let gap_m = max(config.merge_gap_m, min(short.length_m(), config.merge_max_gap_m));
+    hides || overlap_m >= -gap_m && agrees()
+}
+
+/// Distance of the farther end of `short` from the line of `long`, metres.
+fn distance_m(long: &Segment, short: &Segment) -> f32 {
+    let line = long.line();
+    max(line.signed_distance(short.start).abs(), line.signed_distance(short.end).abs())
+}
