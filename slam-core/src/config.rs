@@ -10,6 +10,7 @@ use crate::frontend::extraction::{ExtractionConfig, SplitConfig};
 use crate::geometry::line_noise::LineNoise;
 use crate::geometry::math::min;
 use crate::loop_closure::LoopConfig;
+use crate::map::openings::OpeningConfig;
 use crate::map::visibility::ForgetConfig;
 use crate::odometry::bias::BiasConfig;
 use crate::odometry::delay::DelayConfig;
@@ -77,6 +78,8 @@ pub struct SlamConfig {
     pub loop_closure: Option<LoopConfig>,
     /// What is seen through forgotten, or not.
     pub forgetting: Option<ForgetConfig>,
+    /// Cutting of what was seen through or driven through in part; together with forgetting only.
+    pub openings: Option<OpeningConfig>,
     /// Segments to map.
     pub registration: RegistrationConfig,
 }
@@ -158,6 +161,7 @@ impl Default for SlamConfig {
                 max_gap_m: 0.05,
                 min_incidence_rad: 0.17,
                 max_missing_beams: 4,
+                max_unseen_m: 0.5,
                 split_sigmas: 4.0,
                 merge_chi2: 0.6,
                 trim_sigmas: 2.5,
@@ -226,6 +230,12 @@ impl Default for SlamConfig {
                 same_heading_rad: 0.03,
             }),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
+            openings: Some(OpeningConfig {
+                min_width_m: 0.4,
+                passage_m: 0.5,
+                lines_per_scan: 8,
+                min_hits: 3,
+            }),
             registration: RegistrationConfig::Ekf(EkfConfig {
                 keyframes: KeyframeConfig {
                     way_m: 0.15,
@@ -248,7 +258,7 @@ impl Default for SlamConfig {
                 merge_max_angle_rad: 0.1,
                 merge_max_distance_m: 0.25,
                 merge_gap_m: 0.2,
-                merge_max_gap_m: 1.0,
+                wall_max_gap_m: 1.0,
                 merge_max_nis: 4.0,
                 merge_sigmas: 16.0,
                 merge_overlap: 0.5,
@@ -290,6 +300,7 @@ impl SlamConfig {
             state: STATE,
             loop_closure: None,
             forgetting: None,
+            openings: None,
             registration: RegistrationConfig::EndPoints(EndPointsConfig { weight: EndPointWeight::Equal }),
         }
     }
@@ -403,6 +414,7 @@ impl SlamConfig {
                 positive("extraction.split.max_gap_m", c.max_gap_m)?;
                 positive("extraction.split.min_incidence_rad", c.min_incidence_rad)?;
                 positive("extraction.split.split_sigmas", c.split_sigmas)?;
+                not_negative("extraction.split.max_unseen_m", c.max_unseen_m)?;
                 not_negative("extraction.split.merge_chi2", c.merge_chi2)?;
                 positive("extraction.split.trim_sigmas", c.trim_sigmas)?;
                 positive("extraction.split.max_mean_chi2", c.max_mean_chi2)?;
@@ -469,6 +481,10 @@ impl SlamConfig {
             check("forgetting.min_sine", (0.0..=1.0).contains(&c.min_sine))?;
             check("forgetting.scans", c.scans > 0)?;
         }
+        if let Some(c) = &self.openings {
+            positive("openings.min_width_m", c.min_width_m)?;
+            positive("openings.passage_m", c.passage_m)?;
+        }
         if let RegistrationConfig::Ekf(c) = &self.registration {
             check("registration.ekf.max_updates", (1..=MAX_UPDATES).contains(&usize::from(c.max_updates)))?;
             check("registration.ekf.updates_per_scan", c.updates_per_scan > 0)?;
@@ -489,7 +505,7 @@ impl SlamConfig {
             positive("registration.ekf.merge_max_distance_m", c.merge_max_distance_m)?;
             positive("registration.ekf.merge_sigmas", c.merge_sigmas)?;
             not_negative("registration.ekf.merge_gap_m", c.merge_gap_m)?;
-            not_negative("registration.ekf.merge_max_gap_m", c.merge_max_gap_m)?;
+            not_negative("registration.ekf.wall_max_gap_m", c.wall_max_gap_m)?;
             positive("registration.ekf.merge_max_nis", c.merge_max_nis)?;
             positive("registration.ekf.merge_overlap", c.merge_overlap)?;
         }

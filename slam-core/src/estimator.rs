@@ -8,7 +8,7 @@
 //! each scan, and gathers in its error state what they say of pose, odometry and lines. [`Estimator::commit`] injects the error
 //! state: pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
 
-use nalgebra::{Isometry2, Matrix3, Vector3};
+use nalgebra::{Isometry2, Matrix3, Point2, Vector3};
 
 use crate::config::SlamConfig;
 use crate::ekf::config::{EkfConfig, RegistrationConfig};
@@ -23,6 +23,8 @@ use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covaria
 use crate::geometry::segment::Segment;
 use crate::loop_closure::Closure;
 use crate::map::SegmentMap;
+use crate::map::openings::{OpeningConfig, opening};
+use crate::map::visibility::View;
 use crate::odometry::Increment;
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
@@ -61,6 +63,8 @@ pub(crate) struct Estimator {
     update: KeyframeUpdate,
     /// Where the filter's error state was injected last, with the pose's covariance.
     anchor: Anchor,
+    /// Where the robot was when lines were last opened.
+    opened_from: Point2<f32>,
     /// Scans before the one at hand.
     scans: u32,
     travelled_m: f32,
@@ -86,6 +90,7 @@ impl Estimator {
             keyframe: Keyframe::at(Isometry2::identity(), LocalVariance::default()),
             update: KeyframeUpdate::default(),
             anchor: Anchor::default(),
+            opened_from: Point2::origin(),
             scans: 0,
             travelled_m: 0.0,
         }
@@ -210,6 +215,7 @@ impl Estimator {
         self.inflate_filter(by, around);
         let moved = self.keyframe.map_from_base.inverse() * self.map_from_base;
         self.keyframe.since.before_from_after = normalized(&moved);
+        self.restart_way();
     }
 
     /// Completes the keyframe's update and injects the error state: pose and lines move at once, and lines that turn out to be one
@@ -332,9 +338,48 @@ impl Estimator {
         }
     }
 
+    /// The pose has jumped: that is no way on which lines were crossed.
+    pub fn restart_way(&mut self) {
+        self.opened_from = self.map_from_base.translation.vector.into();
+    }
+
+    /// Opens the lines nearby that the robot has crossed since they were looked at last, or that beams went through in part. While an
+    /// update of the filter is pending, that waits.
+    ///
+    /// Work: two steps for each line, and the look-ups of [`OpeningConfig::lines_per_scan`] of them.
+    pub fn open_lines<const N: usize>(
+        &mut self,
+        config: &OpeningConfig,
+        noise: &LineNoise,
+        nearby: &[u16],
+        view: Option<&View<'_, '_>>,
+        map: &mut SegmentMap<N>,
+    ) {
+        if self.update.is_pending() {
+            return;
+        }
+        let stamp = self.stamp();
+        let here = self.map_from_base.translation.vector.into();
+        let way = [core::mem::replace(&mut self.opened_from, here), here];
+        for (rank, index) in nearby.iter().copied().map(usize::from).enumerate() {
+            let Some(entry) = map.segments().get(index).filter(|e| e.hits >= config.min_hits) else {
+                continue;
+            };
+            let segment = entry.segment;
+            let view = view.filter(|_| config.looks_at(rank, nearby.len(), stamp.scan));
+            let Some(opening) = opening(&segment, way, view, config) else { continue };
+            let parts = opening.cut(&segment);
+            match &mut self.filter {
+                Some(filter) => LineMap { map, filter }.cut(index, parts, noise, &stamp),
+                None => _ = map.cut(index, parts, stamp.scan),
+            }
+        }
+    }
+
     /// Begins anew at a pose that is taken as certain.
     pub fn begin_at(&mut self, map_from_base: Isometry2<f32>, config: &SlamConfig) {
         self.map_from_base = map_from_base;
+        self.restart_way();
         self.local_covariance = Matrix3::zeros();
         self.begin_anew(config);
     }

@@ -8,7 +8,7 @@ use crate::config::SlamConfig;
 use crate::estimator::{Estimator, Surroundings};
 use crate::frontend::Frontend;
 use crate::loop_closure::LoopCloser;
-use crate::map::visibility::{is_gone, mark_seen_through};
+use crate::map::visibility::{View, is_gone, mark_seen_through};
 use crate::map::{MapSegment, SegmentMap};
 use crate::odometry::Increment;
 use crate::odometry::health::{OdometryHealth, ScanEvidence};
@@ -173,6 +173,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let mut around = Surroundings { config, odometry, observed: frontend.segments(), map, tracker };
         if let Some((closure, observability)) = loops.close(&loop_config, estimator, &mut around, watch) {
             (update.closure, update.observability) = (Some(closure), observability);
+            estimator.restart_way();
         }
     }
 
@@ -209,16 +210,24 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         update.registration = estimator.register(update, &mut around);
     }
 
-    /// Forgets what a keyframe has seen through.
+    /// Forgets what a keyframe has seen through, and opens what the robot or beams went through in part.
     fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
-        let is_judged = update.registration.keyframe && update.corrected;
-        let Some(config) = self.config.forgetting.filter(|_| is_judged) else { return };
-        let (sensor, pose, stamp) = (&self.config.sensor, self.estimator.pose(), self.estimator.stamp());
+        let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
+        let Self { config: SlamConfig { sensor, openings, line_noise, .. }, estimator, tracker, map, .. } =
+            self;
+        let (pose, stamp) = (estimator.pose(), estimator.stamp());
         // As the registration left them: fusing may have moved segments.
-        let nearby = self.tracker.nearby.all();
-        mark_seen_through(scan, &pose, stamp.scan, sensor, &config, nearby, &mut self.map);
-        while let Some(index) = self.map.segments().iter().position(|s| is_gone(s, &config)) {
-            self.estimator.forget_line(index, &mut self.map);
+        let nearby = tracker.nearby.all();
+        let view = View::new(scan, &pose, sensor, &config);
+        if update.registration.keyframe {
+            mark_seen_through(&view, stamp.scan, nearby, map);
+        }
+        if let Some(openings) = openings {
+            let view = Some(&view).filter(|_| update.registration.committed);
+            estimator.open_lines(openings, line_noise, nearby, view, map);
+        }
+        while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {
+            estimator.forget_line(index, map);
         }
     }
 

@@ -60,10 +60,10 @@ pub struct EkfConfig {
     pub merge_max_angle_rad: f32,
     /// Two lines of which an end lies farther than this off the other are two walls, metres.
     pub merge_max_distance_m: f32,
-    /// Two lines with a wider gap between them, along, are two walls, metres, …
+    /// Two lines with a wider gap between them, along, are two pieces, metres, …
     pub merge_gap_m: f32,
-    /// … unless the gap is no longer than either, up to this, metres: a wall with a door in it.
-    pub merge_max_gap_m: f32,
+    /// … but of one wall where the gap is no longer than either, up to this, metres: a wall with a door in it.
+    pub wall_max_gap_m: f32,
     /// Within these bounds, largest normalised innovation squared between two lines that are one wall.
     pub merge_max_nis: f32,
     /// Overlapping lines closer than this many standard deviations of a line's offset are one wall whatever their innovation: one

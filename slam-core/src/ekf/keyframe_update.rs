@@ -182,11 +182,11 @@ impl KeyframeUpdate {
             }
             if let (Some(segment), Some(entry)) = (seen.segments.get(pair.observed), map.get_mut(pair.mapped))
             {
-                self.note_seen(entry, slot, segment, &seen.stamp, at);
+                self.note_seen(entry, slot, segment, &seen.stamp, at, config.merge_gap_m);
             }
             report.matched += 1;
         }
-        report.new = add_unknown(seen, at, filter, map);
+        report.new = add_unknown(seen, at, config, filter, map);
         report
     }
 
@@ -198,12 +198,17 @@ impl KeyframeUpdate {
         segment: &Segment,
         stamp: &Stamp,
         at: &LinearizationPoint,
+        max_gap_m: f32,
     ) {
         mark_seen(entry, stamp);
         let moments = &mut entry.segment.moments;
         moments.inliers = moments.inliers.saturating_add(segment.moments.inliers);
         let ends = [segment.start, segment.end];
-        let extended = entry.segment.extended(ends.map(|end| at.pose * end));
+        let ends_in_map = ends.map(|end| at.pose * end);
+        if entry.segment.gap_to_m(ends_in_map) > max_gap_m {
+            return;
+        }
+        let extended = entry.segment.extended(ends_in_map);
         if extended.length_m() > entry.segment.length_m() && self.extensions.push((slot, ends)).is_err() {
             entry.segment = extended;
         }
@@ -297,15 +302,23 @@ fn is_tentative(entry: &MapSegment, age_scans: f32, config: &EkfConfig) -> bool 
     entry.hits < config.tentative_hits && age_scans > config.tentative_scans_per_hit * f32::from(entry.hits)
 }
 
-/// Adds the segments without a pair to the map. Returns how many.
+/// Adds to the map what is not part of a line there. Returns how many segments.
 fn add_unknown<const N: usize>(
     seen: &Observed<'_>,
     at: &LinearizationPoint,
+    config: &EkfConfig,
     filter: &mut EkfSlam,
     map: &mut SegmentMap<N>,
 ) -> u32 {
     let mut new = 0;
-    for segment in seen.unknown() {
+    for (index, segment) in seen.segments.iter().enumerate() {
+        // One with a pair may stand apart from it, behind an opening of the same wall.
+        let pair = seen.pairs.iter().find(|pair| pair.observed == index);
+        let ends = [segment.start, segment.end].map(|end| at.pose * end);
+        let goes_on = |line: &MapSegment| line.segment.gap_to_m(ends) <= config.merge_gap_m;
+        if pair.is_some_and(|pair| map.segments().get(pair.mapped).is_some_and(goes_on)) {
+            continue;
+        }
         let [var_offset, var_direction] =
             seen.sensor.line_noise.added_to(variances(segment), segment.length_m());
         let segment = with_variances(&segment.transformed(&at.pose), var_offset, var_direction);

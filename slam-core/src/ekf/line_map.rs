@@ -5,6 +5,7 @@
 
 use crate::ekf::filter::EkfSlam;
 use crate::ekf::keyframe_update::Stamp;
+use crate::geometry::line_noise::LineNoise;
 use crate::geometry::segment::Segment;
 use crate::map::SegmentMap;
 
@@ -35,6 +36,16 @@ impl<const N: usize> LineMap<'_, N> {
         }
         self.filter.line_removed(gone, last);
         if kept == last { gone } else { kept }
+    }
+
+    /// Leaves of a line what stands on both sides of an opening. The larger part keeps the slot; the other is a line of its own with the
+    /// same errors, but for what parts of a wall have of their own. No update may be pending. Work: the number of states; `N` steps when
+    /// the map is full.
+    pub fn cut(&mut self, index: usize, parts: [Option<Segment>; 2], noise: &LineNoise, stamp: &Stamp) {
+        let Some(other) = self.map.cut(index, parts, stamp.scan) else { return };
+        self.filter.line_replaced(other);
+        let length_m = self.map.segments().get(other).map_or(0.0, |entry| entry.segment.length_m());
+        self.filter.copy_line(index, other, noise.added_to([0.0; 2], length_m), self.map);
     }
 
     /// Forgets a line.
@@ -187,6 +198,32 @@ mod tests {
                 let off = after.segment.midpoint() - before.segment.shifted(error, 0.0).midpoint();
                 prop_assert!(off.norm() < 5e-5, "{tag} is off by {off}");
             }
+        }
+    }
+
+    /// The part that gets a slot of its own is known as well as the other one, and moves with it.
+    #[test]
+    fn parts_of_a_line_have_the_same_errors() {
+        let noise = LineNoise { sigma_offset_m: 1e-3, sigma_direction_rad: 1e-3 };
+        let stamp = Stamp { scan: 2, way_m: 0.0 };
+        let mut map = SegmentMap::<CAPACITY>::new();
+        let mut filter = EkfSlam::new(Vector3::zeros());
+        let mut lines = LineMap { map: &mut map, filter: &mut filter };
+        let index = lines.insert(tagged(1), &Stamp { scan: 1, way_m: 0.0 }).unwrap();
+        lines.filter.augment(index, Vector2::zeros(), lines.map);
+        let whole = lines.map.segments()[index].segment;
+        let at = |along_m: f32| whole.start + whole.direction * along_m;
+        let parts = [(0.0, 0.5), (1.2, 2.0)]
+            .map(|(from, to)| Some(Segment { start: at(from), end: at(to), ..whole }));
+        lines.cut(index, parts, &noise, &stamp);
+        assert_eq!(map.counters().opened, 1);
+        let [kept, other] = [index, 1].map(|index| line_states(filter.slot_of(index).unwrap()));
+        assert_eq!(map.segments()[index].segment.start, at(1.2), "the larger part keeps its slot");
+        assert_eq!(map.segments()[1].segment.end, at(0.5));
+        for (kept, other) in kept.into_iter().zip(other) {
+            let variance = filter.covariance.get(kept, kept);
+            assert_eq!(filter.covariance.get(kept, other), variance);
+            assert!(filter.covariance.get(other, other) > variance, "parts are not quite one line");
         }
     }
 }

@@ -33,20 +33,30 @@ pub(super) fn merge_walls<const N: usize>(
     let mut next = 0;
     while let Some(index) = near.all().get(next).copied().map(usize::from) {
         let Some(changed) = map.segments().get(index).copied() else { break };
-        let is_twin = |other: &usize| {
-            *other != index
-                && map.segments().get(*other).is_some_and(|s| {
-                    one_wall(&changed, s, &pose.translation.vector.into(), &sensor.line_noise, config)
-                })
+        let related = |relation: Relation| {
+            let position = pose.translation.vector.into();
+            let is_related = |other: &usize| {
+                *other != index
+                    && map.segments().get(*other).is_some_and(|s| {
+                        Relation::of(&changed, s, &position, &sensor.line_noise, config) == Some(relation)
+                    })
+            };
+            let mut along =
+                near.along(changed.segment.direction, config.merge_max_angle_rad).map(usize::from);
+            along.find(is_related)
         };
-        let twin = (changed.last_seen == scan)
-            .then(|| {
-                near.along(changed.segment.direction, config.merge_max_angle_rad)
-                    .map(usize::from)
-                    .find(is_twin)
-            })
-            .flatten();
-        let Some(twin) = twin else {
+        if changed.last_seen != scan {
+            next += 1;
+            continue;
+        }
+        let Some(twin) = related(Relation::OnePiece) else {
+            // That a new line goes on behind an opening is learnt once.
+            if changed.hits == 1
+                && let Some(other) = related(Relation::OneWall)
+                && let Some(updated) = update_by_twins([other, index], sensor, config, pose, filter, map)
+            {
+                *pose = updated;
+            }
             next += 1;
             continue;
         };
@@ -80,36 +90,52 @@ fn update_by_twins<const N: usize>(
     filter.update(&measurement, &config.merge_gate(), UpdateScope::All).then(|| filter.commit(pose, map))
 }
 
-/// Whether two lines are one wall: either they agree within their uncertainty, or they lie so close behind each other that one would
-/// hide the other.
-fn one_wall(
-    a: &MapSegment,
-    b: &MapSegment,
-    position: &Point2<f32>,
-    noise: &LineNoise,
-    config: &EkfConfig,
-) -> bool {
-    let (a, b) = (&a.segment, &b.segment);
-    let facing = a.direction.dot(&b.direction) > 0.0;
-    if !facing || cross(a.direction, b.direction).abs() > config.merge_max_angle_rad {
-        return false;
+/// What two lines have to do with each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Relation {
+    /// They are one: they overlap or touch.
+    OnePiece,
+    /// They are parts of one wall, with an opening between them.
+    OneWall,
+}
+
+impl Relation {
+    /// Lines are of one wall where they agree within their uncertainty. They are one piece, too, where they lie so close behind each
+    /// other that one would hide the other.
+    fn of(
+        a: &MapSegment,
+        b: &MapSegment,
+        position: &Point2<f32>,
+        noise: &LineNoise,
+        config: &EkfConfig,
+    ) -> Option<Self> {
+        let (a, b) = (&a.segment, &b.segment);
+        let facing = a.direction.dot(&b.direction) > 0.0;
+        if !facing || cross(a.direction, b.direction).abs() > config.merge_max_angle_rad {
+            return None;
+        }
+        // The shorter one is judged by the longer one's line.
+        let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
+        let distance = distance_m(long, short);
+        if distance > config.merge_max_distance_m {
+            return None;
+        }
+        let gap_m = -long.overlap_m(short);
+        let hides = -gap_m >= config.merge_overlap * short.length_m()
+            && distance <= config.merge_sigmas * noise.sigma_offset_m;
+        let agrees = || {
+            Residual::new(short, long, *position, noise)
+                .is_some_and(|r| r.chi2(&Matrix3::zeros()) <= config.merge_max_nis)
+        };
+        // A long wall goes on behind a door; a short thing beside another is another thing.
+        let widest_m = max(config.merge_gap_m, min(short.length_m(), config.wall_max_gap_m));
+        match () {
+            () if hides => Some(Self::OnePiece),
+            () if gap_m > widest_m || !agrees() => None,
+            () if gap_m > config.merge_gap_m => Some(Self::OneWall),
+            () => Some(Self::OnePiece),
+        }
     }
-    // The shorter one is judged by the longer one's line.
-    let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
-    let distance = distance_m(long, short);
-    if distance > config.merge_max_distance_m {
-        return false;
-    }
-    let overlap_m = long.overlap_m(short);
-    let hides = overlap_m >= config.merge_overlap * short.length_m()
-        && distance <= config.merge_sigmas * noise.sigma_offset_m;
-    let agrees = || {
-        Residual::new(short, long, *position, noise)
-            .is_some_and(|r| r.chi2(&Matrix3::zeros()) <= config.merge_max_nis)
-    };
-    // A long wall goes on behind a door; a short thing beside another is another thing.
-    let gap_m = max(config.merge_gap_m, min(short.length_m(), config.merge_max_gap_m));
-    hides || overlap_m >= -gap_m && agrees()
 }
 
 /// Distance of the farther end of `short` from the line of `long`, metres.

@@ -169,6 +169,44 @@ impl EkfSlam {
         self.covariance.set(offset, direction, d_o);
     }
 
+    /// A line of the map, part of another until now, comes in as a copy of that, but for variances that parts have of their own. Where
+    /// there is no slot for it, its segment carries its marginal variances. No update may be pending.
+    pub(super) fn copy_line<const N: usize>(
+        &mut self,
+        source: usize,
+        index: usize,
+        own_variances: [f32; 2],
+        map: &mut SegmentMap<N>,
+    ) {
+        let Some(slot) = self.slot_of(source) else { return };
+        // Not to be given away for its own copy.
+        self.slots.in_use |= 1 << slot;
+        let states = line_states(slot);
+        let Some(copy) = self.take_slot(map) else {
+            if let Some(entry) = map.get_mut(index) {
+                let [var_offset, var_direction] = states.map(|state| self.covariance.get(state, state));
+                entry.segment = with_variances(&entry.segment, var_offset, var_direction);
+            }
+            return;
+        };
+        self.assign(copy, index, self.age_scans(slot));
+        let own = line_states(copy);
+        for (own_state, state) in own.into_iter().zip(states) {
+            for other in (0..self.covariance.live()).filter(|other| !own.contains(other)) {
+                self.covariance.set(own_state, other, self.covariance.get(state, other));
+            }
+        }
+        let ([offset, direction], [o, d]) = (own, states);
+        let [var_offset, var_direction] = own_variances;
+        self.covariance.set(offset, offset, self.covariance.get(o, o) + var_offset);
+        self.covariance.set(direction, direction, self.covariance.get(d, d) + var_direction);
+        self.covariance.set(offset, direction, self.covariance.get(o, d));
+        let turned = self.slots.turns.get(slot).copied().unwrap_or(0.0);
+        if let Some(turn) = self.slots.turns.get_mut(copy) {
+            *turn = turned;
+        }
+    }
+
     /// A slot without covariances, in use in the current scan.
     fn take_slot<const N: usize>(&mut self, map: &mut SegmentMap<N>) -> Option<usize> {
         let slot = self.slots.next(map)?;

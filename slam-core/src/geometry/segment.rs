@@ -253,9 +253,14 @@ impl Segment {
 
     /// Length over which `other`, projected on this segment, lies within it, metres; negative: the gap between them.
     pub fn overlap_m(&self, other: &Self) -> f32 {
-        let (a, b) = (self.along_of(self.start), self.along_of(self.end));
-        let (c, d) = (self.along_of(other.start), self.along_of(other.end));
-        min(b, max(c, d)) - max(a, min(c, d))
+        -self.gap_to_m([other.start, other.end])
+    }
+
+    /// The gap along this segment to a stretch between two points, metres; negative where they overlap.
+    pub fn gap_to_m(&self, [a, b]: [Point2<f32>; 2]) -> f32 {
+        let (from, to) = (self.along_of(self.start), self.along_of(self.end));
+        let (a, b) = (self.along_of(a), self.along_of(b));
+        max(from, min(a, b)) - min(to, max(a, b))
     }
 
     /// Whether every number is finite.

@@ -4,6 +4,7 @@
 //! Segments of the scan at hand never do. Each eviction and each segment refused is counted.
 
 pub mod nearby;
+pub mod openings;
 pub mod visibility;
 
 use heapless::Vec;
@@ -60,6 +61,8 @@ pub struct MapCounters {
     pub fused: u32,
     /// Segments that beams went through until they were forgotten.
     pub forgotten: u32,
+    /// Openings that were cut into segments.
+    pub opened: u32,
 }
 
 impl<const N: usize> SegmentMap<N> {
@@ -71,7 +74,7 @@ impl<const N: usize> SegmentMap<N> {
     /// No segments.
     pub const fn new() -> Self {
         let () = Self::INDEX_FITS;
-        let counters = MapCounters { added: 0, evicted: 0, refused: 0, fused: 0, forgotten: 0 };
+        let counters = MapCounters { added: 0, evicted: 0, refused: 0, fused: 0, forgotten: 0, opened: 0 };
         Self { segments: Vec::new(), counters }
     }
 
@@ -104,14 +107,18 @@ impl<const N: usize> SegmentMap<N> {
     /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns its index, if it
     /// found a place. Work: `N` steps when full.
     pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> Option<usize> {
-        let entry = MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m };
+        self.insert_entry(MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m }, seen)
+    }
+
+    /// The same for one that may have been seen before; `now` is the scan at hand.
+    pub(crate) fn insert_entry(&mut self, entry: MapSegment, now: u32) -> Option<usize> {
+        let way_m = entry.seen_at_m;
         if self.segments.push(entry).is_ok() {
             self.counters.added = self.counters.added.saturating_add(1);
             return Some(self.segments.len() - 1);
         }
-        let stale = self.segments.iter_mut().enumerate().filter(|(_, s)| s.last_seen != seen);
-        let Some((index, least)) =
-            stale.min_by(|(_, a), (_, b)| a.worth(seen_at_m).total_cmp(&b.worth(seen_at_m)))
+        let stale = self.segments.iter_mut().enumerate().filter(|(_, s)| s.last_seen != now);
+        let Some((index, least)) = stale.min_by(|(_, a), (_, b)| a.worth(way_m).total_cmp(&b.worth(way_m)))
         else {
             self.counters.refused = self.counters.refused.saturating_add(1);
             return None;
@@ -137,6 +144,26 @@ impl<const N: usize> SegmentMap<N> {
         kept.last_seen = kept.last_seen.max(taken.last_seen);
         kept.seen_at_m = max(kept.seen_at_m, taken.seen_at_m);
         self.counters.fused = self.counters.fused.saturating_add(1);
+    }
+
+    /// Leaves of a segment what stands before an opening and behind it; one of which nothing is left counts as seen through. Returns the
+    /// index of the smaller part, which needs room of its own.
+    pub(crate) fn cut(&mut self, index: usize, parts: [Option<Segment>; 2], now: u32) -> Option<usize> {
+        let entry = self.segments.get_mut(index)?;
+        let [first, second] = parts;
+        let (kept, other) = match (first, second) {
+            (Some(first), Some(second)) if second.length_m() > first.length_m() => (second, Some(first)),
+            (Some(first), second) => (first, second),
+            (None, Some(second)) => (second, None),
+            (None, None) => {
+                entry.seen_through = u16::MAX;
+                return None;
+            }
+        };
+        entry.segment = kept;
+        let entry = *entry;
+        self.counters.opened = self.counters.opened.saturating_add(1);
+        self.insert_entry(MapSegment { segment: other?, ..entry }, now)
     }
 
     /// Forgets the segments that are not finite.

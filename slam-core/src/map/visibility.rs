@@ -6,7 +6,7 @@
 //! Only a distance tells that a beam went through; a beam without echo may have met glass. A segment must be seen through
 //! along its whole length, and more often than it was seen.
 
-use nalgebra::{Isometry2, Vector2};
+use nalgebra::{Isometry2, Point2, Vector2};
 
 use crate::geometry::math::{atan2, sqrt};
 use crate::geometry::segment::Segment;
@@ -31,23 +31,97 @@ pub struct ForgetConfig {
 /// Parts of a segment at which beams are looked up.
 const SAMPLES: [f32; 3] = [0.2, 0.5, 0.8];
 
+/// A scan, from where it was taken, and when a beam counts as having gone through.
+pub(crate) struct View<'a, 's> {
+    scan: &'a Scan<'s>,
+    laser_from_map: Isometry2<f32>,
+    sensor: &'a SensorConfig,
+    config: &'a ForgetConfig,
+}
+
+impl<'a, 's> View<'a, 's> {
+    pub fn new(
+        scan: &'a Scan<'s>,
+        pose: &Isometry2<f32>,
+        sensor: &'a SensorConfig,
+        config: &'a ForgetConfig,
+    ) -> Self {
+        let laser_from_map = (pose * sensor.mounting.base_from_laser).inverse();
+        Self { scan, laser_from_map, sensor, config }
+    }
+
+    /// Whether the beam towards the middle of a segment ended there.
+    fn measures(&self, segment: &Segment) -> bool {
+        let point = self.laser_from_map * segment.midpoint();
+        let facing = (self.laser_from_map.rotation * segment.normal()).dot(&point.coords) < 0.0;
+        let distance = sqrt(point.coords.norm_squared());
+        facing
+            && self
+                .range_towards(&point.coords)
+                .is_some_and(|(_, range_m)| (range_m - distance).abs() <= self.margin_m(range_m))
+    }
+
+    /// Whether the beams towards a segment all ended behind it.
+    fn sees_through(&self, segment: &Segment) -> bool {
+        SAMPLES.iter().all(|&share| {
+            let point = segment.start + (segment.end - segment.start) * share;
+            self.beam_through(segment, point).is_some()
+        })
+    }
+
+    /// The beam towards a point of a segment, if it ended behind it. Not if it met the segment too flatly; from which side does not
+    /// matter.
+    pub fn beam_through(&self, segment: &Segment, point: Point2<f32>) -> Option<usize> {
+        let normal = self.laser_from_map.rotation * segment.normal();
+        let point = self.laser_from_map * point;
+        let distance = sqrt(point.coords.norm_squared());
+        if normal.dot(&point.coords).abs() < self.config.min_sine * distance {
+            return None;
+        }
+        let (beam, range_m) = self.range_towards(&point.coords)?;
+        (range_m > distance + self.margin_m(range_m)).then_some(beam)
+    }
+
+    /// How far from a segment a beam of this range may end and have met it.
+    fn margin_m(&self, range_m: f32) -> f32 {
+        self.config.margin_m + self.config.margin_sigmas * sqrt(self.sensor.noise.variance(range_m))
+    }
+
+    /// The beam towards a point of `laser`, and the range that it measured, if it measured one.
+    fn range_towards(&self, point: &Vector2<f32>) -> Option<(usize, f32)> {
+        let sensor = self.sensor;
+        let side = if sensor.mounting.upside_down { -1.0 } else { 1.0 };
+        let geometry = &sensor.geometry;
+        let turn = geometry.steps_per_revolution;
+        let steps =
+            side * atan2(point.y, point.x) / geometry.step_rad() + f32::from(geometry.front_step) + 0.5;
+        // The bearing is known up to a whole turn: the one at or after the first step is taken.
+        let first = f32::from(geometry.first_step);
+        let steps = if steps < first { steps + turn } else { steps };
+        let beam = (steps - first) as usize;
+        let step = geometry.first_step.saturating_add(beam as u16);
+        let (used_from, used_to) = sensor.used_steps;
+        let value_mm = self.scan.ranges_mm.get(beam).filter(|_| (used_from..=used_to).contains(&step))?;
+        match sensor.codes.read(*value_mm) {
+            Reading::Range(range_m) => Some((beam, range_m)),
+            Reading::NoEcho | Reading::Bad => None,
+        }
+    }
+}
+
 /// Counts the scans that have seen through a candidate since it was last seen, this one included. Work: three look-ups for each
 /// candidate.
-pub fn mark_seen_through<const N: usize>(
-    scan: &Scan<'_>,
-    pose: &Isometry2<f32>,
+pub(crate) fn mark_seen_through<const N: usize>(
+    view: &View<'_, '_>,
     scan_number: u32,
-    sensor: &SensorConfig,
-    config: &ForgetConfig,
     candidates: &[u16],
     map: &mut SegmentMap<N>,
 ) {
-    let laser_from_map = (pose * sensor.mounting.base_from_laser).inverse();
     for &candidate in candidates {
         let Some(entry) = map.get_mut(usize::from(candidate)) else { continue };
         if entry.last_seen == scan_number {
             entry.seen_through = 0;
-        } else if seen_through(&entry.segment, scan, &laser_from_map, sensor, config) {
+        } else if view.sees_through(&entry.segment) {
             entry.seen_through = entry.seen_through.saturating_add(1);
         }
     }
@@ -56,21 +130,17 @@ pub fn mark_seen_through<const N: usize>(
 /// How many map segments seen before lie where a scan from this pose measured something, and how many it saw through.
 ///
 /// Work: three look-ups for each candidate.
-pub fn confirmed_and_contradicted(
-    scan: &Scan<'_>,
-    pose: &Isometry2<f32>,
-    sensor: &SensorConfig,
-    config: &ForgetConfig,
+pub(crate) fn confirmed_and_contradicted(
+    view: &View<'_, '_>,
     candidates: &[u16],
     map: &[MapSegment],
 ) -> [u16; 2] {
-    let laser_from_map = (pose * sensor.mounting.base_from_laser).inverse();
     let mut counts = [0u16; 2];
     for entry in candidates.iter().filter_map(|candidate| map.get(usize::from(*candidate))) {
         let counted = match () {
-            () if entry.hits < config.scans => continue,
-            () if seen_through(&entry.segment, scan, &laser_from_map, sensor, config) => 1,
-            () if measured(&entry.segment, scan, &laser_from_map, sensor, config) => 0,
+            () if entry.hits < view.config.scans => continue,
+            () if view.sees_through(&entry.segment) => 1,
+            () if view.measures(&entry.segment) => 0,
             () => continue,
         };
         if let Some(count) = counts.get_mut(counted) {
@@ -80,77 +150,15 @@ pub fn confirmed_and_contradicted(
     counts
 }
 
-/// Whether the beam towards the middle of a segment ended there.
-fn measured(
-    segment: &Segment,
-    scan: &Scan<'_>,
-    laser_from_map: &Isometry2<f32>,
-    sensor: &SensorConfig,
-    config: &ForgetConfig,
-) -> bool {
-    let point = laser_from_map * segment.midpoint();
-    let facing = (laser_from_map.rotation * segment.normal()).dot(&point.coords) < 0.0;
-    let distance = sqrt(point.coords.norm_squared());
-    facing
-        && range_towards(&point.coords, scan, sensor)
-            .is_some_and(|range_m| (range_m - distance).abs() <= margin_m(range_m, sensor, config))
-}
-
 /// Whether a segment has been seen through often enough to be forgotten.
 pub fn is_gone(entry: &MapSegment, config: &ForgetConfig) -> bool {
     entry.seen_through >= config.scans && entry.seen_through >= entry.hits
-}
-
-/// Whether the beams towards a segment all ended behind it.
-fn seen_through(
-    segment: &Segment,
-    scan: &Scan<'_>,
-    laser_from_map: &Isometry2<f32>,
-    sensor: &SensorConfig,
-    config: &ForgetConfig,
-) -> bool {
-    let normal = laser_from_map.rotation * segment.normal();
-    SAMPLES.iter().all(|&share| {
-        let point = laser_from_map * (segment.start + (segment.end - segment.start) * share);
-        let distance = sqrt(point.coords.norm_squared());
-        // Not too flatly; from which side does not matter.
-        if normal.dot(&point.coords).abs() < config.min_sine * distance {
-            return false;
-        }
-        let Some(range_m) = range_towards(&point.coords, scan, sensor) else { return false };
-        range_m > distance + margin_m(range_m, sensor, config)
-    })
-}
-
-/// How far from a segment a beam of this range may end and have met it.
-fn margin_m(range_m: f32, sensor: &SensorConfig, config: &ForgetConfig) -> f32 {
-    config.margin_m + config.margin_sigmas * sqrt(sensor.noise.variance(range_m))
-}
-
-/// Range that the beam towards a point of `laser` measured, if it measured one.
-fn range_towards(point: &Vector2<f32>, scan: &Scan<'_>, sensor: &SensorConfig) -> Option<f32> {
-    let side = if sensor.mounting.upside_down { -1.0 } else { 1.0 };
-    let geometry = &sensor.geometry;
-    let turn = geometry.steps_per_revolution;
-    let steps = side * atan2(point.y, point.x) / geometry.step_rad() + f32::from(geometry.front_step) + 0.5;
-    // The bearing is known up to a whole turn: the one at or after the first step is taken.
-    let first = f32::from(geometry.first_step);
-    let steps = if steps < first { steps + turn } else { steps };
-    let beam = (steps - first) as usize;
-    let step = geometry.first_step.saturating_add(beam as u16);
-    let (used_from, used_to) = sensor.used_steps;
-    let value_mm = scan.ranges_mm.get(beam).filter(|_| (used_from..=used_to).contains(&step))?;
-    match sensor.codes.read(*value_mm) {
-        Reading::Range(range_m) => Some(range_m),
-        Reading::NoEcho | Reading::Bad => None,
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::SlamConfig;
-    use nalgebra::Point2;
 
     const CONFIG: ForgetConfig = ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.3, scans: 3 };
 
@@ -169,7 +177,8 @@ mod tests {
             let ranges = [range_mm; 682];
             let scan = Scan { ranges_mm: &ranges };
             let here = Isometry2::identity();
-            mark_seen_through(&scan, &here, scan_number, &sensor, &CONFIG, &[0], &mut map);
+            let view = View::new(&scan, &here, &sensor, &CONFIG);
+            mark_seen_through(&view, scan_number, &[0], &mut map);
             if map.segments().first().is_some_and(|s| is_gone(s, &CONFIG)) {
                 map.forget(0);
             }
@@ -199,14 +208,17 @@ mod tests {
         let sensor = SlamConfig::paper().sensor;
         let ranges = [1234u16; 682];
         let scan = Scan { ranges_mm: &ranges };
-        assert!(range_towards(&Vector2::new(1.0, 0.0), &scan, &sensor).is_some());
-        assert!(range_towards(&Vector2::new(-1.0, 0.0), &scan, &sensor).is_none());
+        let here = Isometry2::identity();
+        let view = View::new(&scan, &here, &sensor, &CONFIG);
+        assert!(view.range_towards(&Vector2::new(1.0, 0.0)).is_some());
+        assert!(view.range_towards(&Vector2::new(-1.0, 0.0)).is_none());
         for (beam, bearing) in [(0usize, -119.53f32), (340, 0.0), (681, 119.88)] {
             let mut ranges = [0u16; 682];
             ranges[beam] = 1000;
             let (s, c) = bearing.to_radians().sin_cos();
             let scan = Scan { ranges_mm: &ranges };
-            assert!(range_towards(&Vector2::new(c, s), &scan, &sensor).is_some(), "{beam}");
+            let view = View::new(&scan, &here, &sensor, &CONFIG);
+            assert_eq!(view.range_towards(&Vector2::new(c, s)).map(|(at, _)| at), Some(beam));
         }
     }
 }

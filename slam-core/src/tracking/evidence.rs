@@ -6,7 +6,7 @@ use super::Tracker;
 use super::state::Evidence;
 use super::tracker::Scene;
 use crate::geometry::math::sqrt;
-use crate::map::visibility::confirmed_and_contradicted;
+use crate::map::visibility::{View, confirmed_and_contradicted};
 use crate::odometry::Increment;
 use crate::sensor::scan::Scan;
 
@@ -43,8 +43,8 @@ impl<const N: usize> Tracker<N> {
             && score < scene.config.state.good_score
         {
             let (sensor, nearby) = (&scene.config.sensor, self.nearby.all());
-            let [confirmed, contradicted] =
-                confirmed_and_contradicted(scan, pose, sensor, config, nearby, scene.map);
+            let view = View::new(scan, pose, sensor, config);
+            let [confirmed, contradicted] = confirmed_and_contradicted(&view, nearby, scene.map);
             contradicted_share =
                 f32::from(contradicted) / f32::from(confirmed.saturating_add(contradicted).max(1));
         }

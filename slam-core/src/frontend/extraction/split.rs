@@ -45,8 +45,10 @@ pub struct SplitConfig {
     pub max_gap_m: f32,
     /// A surface seen at a flatter angle than this is not followed across wider spacings, radians.
     pub min_incidence_rad: f32,
-    /// Most beams without a distance inside a segment.
+    /// Most beams without a distance inside a segment, …
     pub max_missing_beams: u16,
+    /// … which may have met no wall at all where they leave a wider gap than this, metres: an opening seen at a slant.
+    pub max_unseen_m: f32,
     /// A point this many standard deviations off the chord splits a piece.
     pub split_sigmas: f32,
     /// Neighbouring pieces are one line when joining them costs each point of the smaller piece no more χ² than this.
@@ -108,6 +110,9 @@ impl Extraction<'_> {
         let apart2 = (b.position - a.position).norm_squared();
         if apart2 <= self.config.max_gap_m * self.config.max_gap_m {
             return true;
+        }
+        if beams > 1 && apart2 > self.config.max_unseen_m * self.config.max_unseen_m {
+            return false;
         }
         let range_m = min(a.range_m, b.range_m);
         let gap_m = max(self.spacing_per_m * range_m * f32::from(beams), self.config.max_gap_m);
