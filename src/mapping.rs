@@ -224,14 +224,17 @@ impl Mapping {
         }
         let period_us = (STATUS_EVERY + (now - self.next_status)).as_micros();
         self.next_status = now + STATUS_EVERY;
-        let slam = self.keeper.mapper().slam();
+        let mapper = self.keeper.mapper();
+        let slam = mapper.slam();
+        let (delay_s, delay_sigma_s, delay_used) =
+            mapper.delay().map_or((0.0, 0.0, false), |delay| (delay.delay_s, delay.sigma_s, delay.used));
         let (pose, covariance) = (components(&slam.pose()), slam.covariance());
         let scans = STATE.scans.load(Ordering::Relaxed);
         let new = scans.wrapping_sub(core::mem::replace(&mut self.scans_at_status, scans));
         let permille = core::mem::take(&mut self.busy_us) * 1000 / period_us.max(1);
         defmt::info!(
             "x {=f32} y {=f32} heading {=f32}, sigma {=f32} {=f32} {=f32}, {=usize} segments, {=u32} scans in {=u64} ms, \
-             update {=u32} us, cpu {=u64} permille",
+             update {=u32} us, cpu {=u64} permille, delay {=f32} s, sigma {=f32} s, used {=bool}",
             pose.x,
             pose.y,
             pose.z,
@@ -242,7 +245,10 @@ impl Mapping {
             new,
             period_us / 1000,
             self.last_took_us,
-            permille
+            permille,
+            delay_s,
+            delay_sigma_s,
+            delay_used
         );
         defmt::info!(
             "lidar: missed {=u32}, dropped {=u32}, port errors {=u32}, losses {=u32}; {}; {}",
@@ -251,7 +257,7 @@ impl Mapping {
             STATE.port_errors.load(Ordering::Relaxed),
             STATE.losses.load(Ordering::Relaxed),
             slam.counters(),
-            self.keeper.mapper().counters()
+            mapper.counters()
         );
         defmt::info!(
             "stack: {=u32} bytes at most, {=u32} in thread mode, {=u32} in the urgent executor",

@@ -9,7 +9,7 @@ use slam_core::geometry::pose::components;
 use crate::kept::{Mapper, SAMPLES};
 
 /// Changes with the layout.
-const LAYOUT: u32 = 1;
+const LAYOUT: u32 = 2;
 
 /// What was done to the map.
 #[repr(u32)]
@@ -25,7 +25,7 @@ pub enum Event {
     Recovered = 4,
 }
 
-/// The record. Every field is of four or eight bytes, little-endian, without padding.
+/// The record. Every field is of four or eight bytes, little-endian, without padding between them.
 #[repr(C)]
 pub struct Trace {
     layout: u32,
@@ -48,6 +48,8 @@ pub struct Trace {
     segments: u32,
     /// What the work took, microseconds.
     took_us: u32,
+    /// The [`TrackingState`](slam_core::tracking::TrackingState) after the event.
+    state: u32,
 }
 
 #[unsafe(no_mangle)]
@@ -64,6 +66,7 @@ static mut TRACE: Trace = Trace {
     sigmas: [0.0; 3],
     segments: 0,
     took_us: 0,
+    state: 0,
 };
 
 /// The one writer of the record.
@@ -98,6 +101,7 @@ impl Tracer {
         t.sigmas = [0, 1, 2].map(|i| sigma(covariance.get((i, i)).copied().unwrap_or(0.0)));
         t.segments = mapper.slam().map().segments().len() as u32;
         t.took_us = took_us;
+        t.state = mapper.slam().state() as u32;
         // Last, and seen so by whoever reads memory.
         core::sync::atomic::compiler_fence(core::sync::atomic::Ordering::SeqCst);
         // SAFETY: a field of a record that this alone refers to.

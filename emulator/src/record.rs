@@ -5,9 +5,10 @@ use rigless::emulator::Host;
 use rigless::soc::Width;
 use slam_core::WheelTicks;
 use slam_core::geometry::pose::pose;
+use slam_core::tracking::TrackingState;
 
 /// The layout that is understood.
-const LAYOUT: u64 = 1;
+const LAYOUT: u64 = 2;
 /// Samples in the record's ring.
 const RING: u64 = 64;
 
@@ -49,6 +50,8 @@ pub struct Entry {
     pub sigmas: Vector3<f32>,
     /// Segments of the map.
     pub segments: u32,
+    /// How far the firmware relies on the pose.
+    pub state: TrackingState,
 }
 
 impl Entry {
@@ -131,9 +134,18 @@ impl Recorder {
             pose: Vector3::new(float(host, 2)?, float(host, 3)?, float(host, 4)?),
             sigmas: Vector3::new(float(host, 5)?, float(host, 6)?, float(host, 7)?),
             segments: word(host, 8)?,
+            state: state(word(host, 10)?)?,
         });
         Ok(true)
     }
+}
+
+/// The state that the firmware wrote as a number.
+fn state(number: u32) -> anyhow::Result<TrackingState> {
+    [TrackingState::Tracking, TrackingState::Uncertain, TrackingState::Lost]
+        .into_iter()
+        .find(|state| *state as u32 == number)
+        .ok_or_else(|| anyhow::anyhow!("a tracking state of number {number}"))
 }
 
 fn read_u64(host: &mut dyn Host, at: u64) -> anyhow::Result<u64> {

@@ -9,6 +9,7 @@ use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
 use slam_core::odometry::Integration;
 use slam_core::sensor::scan::Reading;
+use slam_core::tracking::TrackingState;
 use slam_core::{MapSegment, Mapper, Segment, WheelTicks};
 
 use crate::record::{Entry, Event};
@@ -42,6 +43,9 @@ pub struct Report {
     pub worst_position_error_m: f64,
     /// Error of the stamps that the firmware gave its scans, microseconds: mean, largest.
     pub stamp_error_us: [i64; 2],
+    /// By how much scans are stamped late by the firmware's own estimate, and its standard deviation, as its status said last,
+    /// seconds; `None` where the run was too short for one.
+    pub estimated_delay_s: Option<[f32; 2]>,
     /// Segments of the map.
     pub segments: usize,
     /// What a scan takes on the microcontroller, microseconds: median, 99 of 100, largest.
@@ -134,6 +138,7 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
             late_us.iter().sum::<i64>() / late_us.len().max(1) as i64,
             late_us.iter().map(|us| us.abs()).max().unwrap_or(0),
         ],
+        estimated_delay_s: estimated_delay_s(outcome),
         segments: map.len(),
         update_us: [share(50), share(99), share(100)],
         cpu_share: busy_us as f64 / outcome.end_us.max(1) as f64,
@@ -156,6 +161,16 @@ fn stack_bytes(outcome: &Outcome) -> [u32; 3] {
         Some([all.parse().ok()?, thread.parse().ok()?, urgent.parse().ok()?])
     });
     said.fold([0u32; 3], |most, now: [u32; 3]| std::array::from_fn(|k| most[k].max(now[k])))
+}
+
+/// The delay that the firmware's status said last.
+fn estimated_delay_s(outcome: &Outcome) -> Option<[f32; 2]> {
+    outcome.log.iter().rev().find_map(|line| {
+        let (_, rest) = line.text.split_once(" permille, delay ")?;
+        let (delay_s, rest) = rest.split_once(" s, sigma ")?;
+        let (sigma_s, _) = rest.split_once(" s, ")?;
+        Some([delay_s.parse().ok()?, sigma_s.parse().ok()?])
+    })
 }
 
 /// The map that the firmware printed last when its button was pressed.
@@ -231,6 +246,8 @@ pub struct Difference {
     pub here: [f32; 3],
     /// x, y, θ on the board.
     pub board: [f32; 3],
+    /// The tracking state on the PC, and on the board.
+    pub states: [TrackingState; 2],
 }
 
 /// Where a PC, fed the same ticks and scans, parts from the firmware: `None` if it never does.
@@ -254,9 +271,12 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
         }
         let here = slam_core::geometry::pose::components(&mapper.slam().pose());
         let same = (0..3).all(|i| here[i].to_bits() == entry.pose[i].to_bits())
-            && mapper.slam().map().segments().len() == entry.segments as usize;
+            && mapper.slam().map().segments().len() == entry.segments as usize
+            && mapper.slam().state() == entry.state;
         if !same {
-            return Ok(Some(Difference { entry: number, here: here.into(), board: entry.pose.into() }));
+            let states = [mapper.slam().state(), entry.state];
+            let (here, board) = (here.into(), entry.pose.into());
+            return Ok(Some(Difference { entry: number, here, board, states }));
         }
     }
     Ok(None)

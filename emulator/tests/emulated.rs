@@ -6,6 +6,7 @@ use common::{hall, hall_in_cycles, last_error_m, nothing_lost, robot, run_in, sa
 use emulator::board::check_assumed_cycles;
 use emulator::record::Event;
 use emulator::report::first_difference;
+use slam_core::tracking::TrackingState;
 
 #[test]
 fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
@@ -41,6 +42,9 @@ fn the_hall_is_mapped_every_scan_used_and_the_watchdog_quiet() {
 fn the_board_and_the_pc_agree_bit_for_bit_over_sixty_seconds() {
     let (outcome, judged) = hall(Some(60), &[]);
     assert!(judged.report.scans_used > 560, "{}", judged.report.scans_used);
+    // The firmware stamps its scans within a millisecond or two; it does not know, and says how unsure it is.
+    let [delay_s, sigma_s] = judged.report.estimated_delay_s.expect("the status says the delay");
+    assert!(sigma_s > 0.0 && delay_s.abs() <= 3.0 * sigma_s, "{delay_s} {sigma_s}");
     assert_eq!(first_difference(&outcome.entries, &robot()).unwrap(), None);
     // The comparison can fail: one range changed by a millimetre is noticed.
     let mut entries = outcome.entries;
@@ -49,6 +53,11 @@ fn the_board_and_the_pc_agree_bit_for_bit_over_sixty_seconds() {
         ranges_mm.iter_mut().for_each(|r| *r += 1);
     }
     assert!(first_difference(&entries, &robot()).unwrap().is_some());
+    // And so is a state that is another, though the pose is the same.
+    let (number, state) = (entries.len() - 30, TrackingState::Lost);
+    entries[number].state = state;
+    let difference = first_difference(&entries, &robot()).unwrap().unwrap();
+    assert_eq!((difference.entry, difference.here, difference.states[1]), (number, difference.board, state));
 }
 
 #[test]

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use lineslam::configuration::Configuration;
 use lineslam::experiments::papers::{self, PaperRun};
-use lineslam::experiments::{FEATURELESS, Run, simulated};
+use lineslam::experiments::{Case, FEATURELESS, Run, simulated};
+use lineslam::sim::SimKind;
 use lineslam::sim::world::World;
 
 const SEEDS: std::ops::Range<u64> = 301..309;
@@ -13,7 +14,8 @@ const SEEDS: std::ops::Range<u64> = 301..309;
 fn drives(name: &'static str, condition: usize) -> Vec<Run> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../worlds").join(format!("{name}.toml"));
     let world = World::load(&path).unwrap();
-    let drive = |seed: u64| simulated(name, &world, condition, seed).unwrap();
+    let case = Case { condition, ..Case::usual(name, SimKind::Ideal) };
+    let drive = |seed: u64| simulated(case, &world, seed).unwrap();
     let (even, odd): (Vec<u64>, Vec<u64>) = SEEDS.partition(|seed| seed % 2 == 0);
     std::thread::scope(|scope| {
         let other = scope.spawn(|| even.into_iter().map(drive).collect::<Vec<Run>>());
@@ -26,7 +28,7 @@ fn drives(name: &'static str, condition: usize) -> Vec<Run> {
 /// Corner error of each drive, metres; no drive may lose track, no map may be without corners.
 fn corner_errors(runs: &[Run]) -> Vec<f64> {
     for run in runs {
-        assert!(!run.default.lost(), "{}: {:?}", run.world, run.default.judgement);
+        assert!(!run.default.lost(), "{}: {:?}", run.case.world, run.default.judgement);
     }
     runs.iter().map(|r| r.default.judgement.corner_error_m.expect("the map has corners")).collect()
 }

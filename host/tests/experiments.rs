@@ -45,6 +45,22 @@ fn the_page_has_its_tables_figures_and_command() {
             assert_eq!(page.lines().filter(is_row).count(), 6, "{configuration}, {drives}");
         }
     }
+    for world in ["hall", "corridor", "office", "lab", "flat", "twins", "loop"] {
+        for kind in ["ideal", "real"] {
+            let is_row = |line: &&str| {
+                let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+                cells.get(1..3) == Some(&[world, kind])
+            };
+            // Corners, trajectories, covariance.
+            assert_eq!(page.lines().filter(is_row).count(), 3, "{world}, {kind}");
+        }
+    }
+    assert!(page.contains("Of 23 limits ") || page.contains("All 23 limits are kept."), "the limits");
+    assert_eq!(
+        page.matches("| 1 m back").count() + page.matches("| 8 m back").count(),
+        8,
+        "lifted in four worlds"
+    );
     for image in images {
         let svg = std::fs::read_to_string(folder.path().join("images").join(image)).unwrap();
         assert!(svg.starts_with("<svg"), "{image}");

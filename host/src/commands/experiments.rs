@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use lineslam::experiments::{self, document};
+use lineslam::experiments::{self, document, kidnapped, kinds_page};
 use lineslam::output;
 
 use super::common::progress_bar;
@@ -18,7 +18,7 @@ pub struct Args {
     /// RANSAC seeds of each drive, for the paper's configurations.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     ransac_seeds: u64,
-    /// Folder of the worlds hall, corridor, office and parallel.
+    /// Folder of the worlds hall, corridor, office, lab, flat, twins, loop and parallel.
     #[arg(long, value_name = "FOLDER", default_value = "worlds")]
     worlds: PathBuf,
     /// Folder for experiments.md and images/.
@@ -46,8 +46,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             .map(|(name, text)| (Path::new("images").join(name), text.clone().into_bytes())),
     );
     output::write_all(&args.out, &files)?;
+    println!("{}\n", kinds_page::missed(&results.runs));
+    println!("{}\n\n{}\n", kinds_page::corners(&results), kinds_page::trajectories(&results));
     println!("{}\n\n{}", document::buildings(&results), document::robustness(&results));
-    println!("\n{}\n\n{}", document::honesty(&results), document::featureless(&results));
+    println!("\n{}\n\n{}", kidnapped::fates(&results), document::honesty(&results));
+    println!("\n{}", document::featureless(&results));
     println!("\nwritten to {}", args.out.join("experiments.md").display());
     Ok(())
 }

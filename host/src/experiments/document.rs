@@ -4,8 +4,11 @@ use std::fmt::Write;
 
 use comfy_table::{CellAlignment, Row, Table, presets};
 
-use super::{BUILDINGS, CONDITIONS, FEATURELESS, LOST_M, Measured, Results, Run, papers_page};
+use super::{
+    BUILDINGS, CONDITIONS, Case, FEATURELESS, Measured, Results, Run, kidnapped, kinds_page, papers_page,
+};
 use crate::score::Spread;
+use crate::sim::SimKind;
 use crate::sim::judge::NEES_INSTANTS;
 
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
@@ -27,7 +30,7 @@ pub(super) fn metres(value: f64) -> String {
 }
 
 /// Share of the blueprint's corners that the maps have as they lie.
-fn corners_found<'a>(measured: impl Iterator<Item = &'a Measured> + Clone) -> String {
+pub(super) fn corners_found<'a>(measured: impl Iterator<Item = &'a Measured> + Clone) -> String {
     corners_share(measured, &|m| m.judgement.corners_found)
 }
 
@@ -41,13 +44,14 @@ pub(super) fn corners_share<'a>(
     format!("{:.0} %", 100.0 * share / named.max(1) as f64)
 }
 
-/// The drives of a world under a condition.
-fn drives<'a>(
-    results: &'a Results,
-    world: &'a str,
-    condition: usize,
-) -> impl Iterator<Item = &'a Run> + Clone {
-    results.runs.iter().filter(move |r| r.world == world && r.condition == condition)
+/// The drives of a case.
+pub(super) fn drives(results: &Results, case: Case) -> impl Iterator<Item = &Run> + Clone {
+    results.runs.iter().filter(move |r| r.case == case)
+}
+
+/// How many of the drives lost track.
+pub(super) fn lost<'a>(measured: impl Iterator<Item = &'a Measured> + Clone) -> String {
+    format!("{} of {}", measured.clone().filter(|m| m.lost()).count(), measured.count())
 }
 
 /// Table 1: what the paper measured, dead reckoning, and ours.
@@ -68,7 +72,7 @@ pub fn buildings(results: &Results) -> Table {
         "lost track",
     ]);
     for building in BUILDINGS {
-        let all = || drives(results, building.name, 0);
+        let all = || drives(results, Case::usual(building.name, SimKind::Ideal));
         let blank = |name: &str| {
             let mut row = vec![building.name.to_owned(), name.to_owned()];
             row.resize(13, "–".into());
@@ -106,7 +110,7 @@ pub fn buildings(results: &Results) -> Table {
             metres(over(|m| m.judgement.trajectory.final_position_error_m)),
             format!("{:.2}°", over(|m| m.judgement.trajectory.final_heading_error_deg)),
             format!("{:.0}", over(|m| m.segments as f64)),
-            format!("{} of {}", ours().filter(|m| m.lost()).count(), ours().count()),
+            lost(ours()),
         ]);
     }
     table
@@ -125,7 +129,8 @@ pub fn robustness(results: &Results) -> Table {
     ]);
     for (index, condition) in CONDITIONS.iter().enumerate() {
         for building in BUILDINGS {
-            let all = || drives(results, building.name, index).map(|r| &r.default);
+            let case = Case { world: building.name, kind: SimKind::Ideal, condition: index };
+            let all = || drives(results, case).map(|r| &r.default);
             let corners = Spread::of(all().filter_map(|m| m.judgement.corner_error_m));
             let corner = |value: fn(&Spread) -> f64| metres(corners.as_ref().map_or(f64::NAN, value));
             table.add_row([
@@ -135,7 +140,7 @@ pub fn robustness(results: &Results) -> Table {
                 corner(|s| s.worst),
                 metres(mean(all().map(|m| m.judgement.trajectory.ate_rmse_m))),
                 corners_found(all()),
-                format!("{} of {}", all().filter(|m| m.lost()).count(), all().count()),
+                lost(all()),
             ]);
         }
     }
@@ -146,34 +151,64 @@ pub fn robustness(results: &Results) -> Table {
 pub fn honesty(results: &Results) -> Table {
     let mut table = table([
         "building",
+        "kind",
+        "drives",
         "NEES, mean",
-        "95 % band of its mean over seeds",
+        "95 % band of its mean over the drives",
         "instants within it",
         "along the heading within 2σ",
-        "spurious segments per 100",
+        "spurious segments per 100 others",
     ]);
-    for building in BUILDINGS {
-        let all = || drives(results, building.name, 0).map(|r| &r.default.judgement);
+    for case in kinds_page::cases() {
+        let all = || drives(results, case).map(|r| &r.default.judgement);
         let (low, high) = nees_band(all().count());
         let at = |instant: usize| mean(all().filter_map(|j| j.nees.get(instant).copied()));
         let within = (0..NEES_INSTANTS).map(at).filter(|v| (low..=high).contains(v)).count();
         let spurious: usize = all().map(|j| j.spurious_segments).sum();
         let established: usize = all().map(|j| j.established_segments).sum();
         table.add_row([
-            building.name.to_owned(),
+            case.world.to_owned(),
+            case.kind.name().into(),
+            all().count().to_string(),
             format!("{:.2}", mean(all().map(|j| j.mean_nees))),
             format!("{low:.2} to {high:.2}"),
             format!("{within} of {NEES_INSTANTS}"),
             format!("{:.0} %", 100.0 * mean(all().map(|j| j.along_within_two_sigma))),
-            format!("{:.1}", 100.0 * spurious as f64 / (established - spurious).max(1) as f64),
+            per_100(spurious, established),
         ]);
     }
     table
 }
 
+/// Spurious segments per hundred of the other established ones.
+pub(super) fn per_100(spurious: usize, established: usize) -> String {
+    format!("{:.1}", 100.0 * spurious as f64 / (established - spurious).max(1) as f64)
+}
+
+/// Where the mean NEES lies outside its band, in a sentence.
+pub fn dishonest(results: &Results) -> String {
+    let mut outside = Vec::new();
+    for case in kinds_page::cases() {
+        let all = || drives(results, case).map(|r| r.default.judgement.mean_nees);
+        let (low, high) = nees_band(all().count());
+        let mean = mean(all());
+        if !(low..=high).contains(&mean) {
+            outside.push(format!("{}, {} ({mean:.2})", case.world, case.kind.name()));
+        }
+    }
+    match outside.len() {
+        0 => "The mean is within the band in every building and kind.".into(),
+        n => format!(
+            "The mean is outside the band in {n} of {}: {}.",
+            kinds_page::cases().count(),
+            outside.join("; ")
+        ),
+    }
+}
+
 /// Bounds within which the mean of a χ² of three degrees of freedom over `n` samples lies in 95 % of all cases, by
 /// Wilson and Hilferty's approximation.
-fn nees_band(n: usize) -> (f64, f64) {
+pub fn nees_band(n: usize) -> (f64, f64) {
     let freedom = 3.0 * n.max(1) as f64;
     let quantile = |z: f64| {
         let spread = 2.0 / (9.0 * freedom);
@@ -185,7 +220,7 @@ fn nees_band(n: usize) -> (f64, f64) {
 /// Two parallel walls: what is seen and what is not.
 pub fn featureless(results: &Results) -> Table {
     let mut table = table(["", "mean", "worst"]);
-    let all = || drives(results, FEATURELESS, 0);
+    let all = || drives(results, Case::usual(FEATURELESS, SimKind::Ideal));
     let mut row = |name: &str, unit: &str, digits: usize, values: Vec<f64>| {
         let show = |v: f64| format!("{v:.digits$} {unit}");
         let spread = Spread::of(values.into_iter());
@@ -206,7 +241,6 @@ pub fn featureless(results: &Results) -> Table {
 
 /// The page. `command` is what the reader types for it, `images` the figures' folder as seen from the page.
 pub fn render(results: &Results, command: &str, images: &str) -> String {
-    let (first, last) = (results.seeds.start, results.seeds.end - 1);
     let mut page = String::new();
     let mut say = |text: &str| {
         // Writing to a String cannot fail.
@@ -215,44 +249,105 @@ pub fn render(results: &Results, command: &str, images: &str) -> String {
     say("# Experiments");
     say(&format!("All of this page, figures included, is written by\n\n```sh\n{command}\n```"));
     say("Simulated drives. Recorded logs that others use too are in [benchmark.md](benchmark.md).");
-    say("## The paper's buildings");
-    say(&format!(
-        "Simulated drives with seeds {first} to {last}. Each seed draws wheels that are 1 % larger or smaller than the\n\
-         robot file says, a track off by 2 %, slip, and a URG-04LX with σ of 10 mm to 1 m and 1 % of the range beyond, dropouts\n\
-         and mixed pixels. The corner error is equation (11): the mean distance between the blueprint's corners and the\n\
-         crossings of the map's lines there, once as the map lies, in the frame in which the drive began, and once with the map\n\
-         laid over the blueprint by a rotation and a translation, as the paper lays it. The trajectory error is after one SE(2)\n\
-         alignment. A drive has lost track when the robot was once farther than {LOST_M} m from where it\n\
-         thought it was. Metres where nothing else is said; means over the seeds."
-    ));
-    say(&buildings(results).to_string());
-    say("The hall of the paper's Fig. 8a, with the estimated path in red on the true one in green:");
-    say(&format!("![Map of the hall over its blueprint]({images}/hall.svg)"));
-    say("The same scans by dead reckoning (Fig. 8b), which drives through the block in the middle:");
-    say(&format!("![The hall by dead reckoning]({images}/hall_dead_reckoning.svg)"));
-    say("The corridor (Fig. 9), there and back:");
-    say(&format!("![Map of the corridor over its blueprint]({images}/corridor.svg)"));
-    say("The office, in which three people walk:");
-    say(&format!("![Map of the office over its blueprint]({images}/office.svg)"));
-    for paragraph in papers_page::section(results, images) {
-        say(&paragraph);
+    for part in
+        [both_kinds(results), papers_buildings(results, images), papers_page::section(results, images)]
+    {
+        part.iter().for_each(|text| say(text));
     }
-    say("## When the robot is worse");
-    say("The default configuration, same seeds, same constants:");
-    say(&robustness(results).to_string());
-    say("## Is the covariance honest?");
-    say(&format!(
-        "The normalised estimation error squared (NEES) of the pose is 3 on average when the covariance is that of the error. \
-         Held\nagainst it at {NEES_INSTANTS} instants of each drive. A segment is spurious when it was seen in at least three \
-         scans and most\nof it is farther than 0.15 m from everything that stands still."
-    ));
-    say(&honesty(results).to_string());
+    for part in [worse(results), kidnapped::section(results), covariance(results)] {
+        part.iter().for_each(|text| say(text));
+    }
     say("## Two parallel walls");
-    say("30 m between two walls without any feature. Along them only the wheels know.");
+    say("30 m between two walls without any feature, ideal kind. Along them only the wheels know.");
     say(&featureless(results).to_string());
     page.truncate(page.trim_end().len());
     page.push('\n');
     page
+}
+
+fn both_kinds(results: &Results) -> Vec<String> {
+    let [drives, kinds, measures, scale] = kinds_page::method(results);
+    vec![
+        "## How it is measured".into(),
+        paragraph(&drives),
+        kinds,
+        paragraph(&measures),
+        paragraph(&scale),
+        "## Ideal and real".into(),
+        paragraph(
+            "The default configuration. What is asked of it stands beside what was measured: `≤` where it is kept, bold and `>`
+            where it is not. Corners as the map lies are limited for the ideal kind, corners and trajectory aligned with a scale for
+            the real one, and of hall, corridor, office, lab and flat no drive may lose track.",
+        ),
+        kinds_page::missed(&results.runs),
+        "Corner error, equation (11), metres:".into(),
+        kinds_page::corners(results).to_string(),
+        paragraph(
+            "Trajectory error, rmse, metres. The end of the drive is the distance of the last position from the truth, unaligned,
+            and beside it that of the wheels alone. In the loop, a corridor round a block that ends where it began, it is what is
+            left once the loop is closed, or the whole drift where it is not:",
+        ),
+        kinds_page::trajectories(results).to_string(),
+    ]
+}
+
+fn papers_buildings(results: &Results, images: &str) -> Vec<String> {
+    vec![
+        "## The paper's buildings".into(),
+        paragraph(
+            "What the paper measured in a hall and a corridor of this kind, what the wheels alone say, and the default, errors of the
+            ideal kind. The trajectory error is aligned; the final position and heading are as they are.",
+        ),
+        buildings(results).to_string(),
+        "The hall of the paper's Fig. 8a, with the estimated path in red on the true one in green:".into(),
+        format!("![Map of the hall over its blueprint]({images}/hall.svg)"),
+        "The same scans by dead reckoning (Fig. 8b), which drives through the block in the middle:".into(),
+        format!("![The hall by dead reckoning]({images}/hall_dead_reckoning.svg)"),
+        "The corridor (Fig. 9), there and back:".into(),
+        format!("![Map of the corridor over its blueprint]({images}/corridor.svg)"),
+        "The office, in which three people walk:".into(),
+        format!("![Map of the office over its blueprint]({images}/office.svg)"),
+    ]
+}
+
+fn worse(results: &Results) -> Vec<String> {
+    vec![
+        "## When the robot is worse".into(),
+        "The default configuration, same seeds, same constants; errors of the ideal kind but for what is named:".into(),
+        robustness(results).to_string(),
+    ]
+}
+
+fn covariance(results: &Results) -> Vec<String> {
+    let about = format!(
+        "The normalised estimation error squared (NEES) of the pose is 3 on average when the covariance is that of the error. It is
+        above the band where the robot is surer than it should be, below it where it is more careful. The pose is held against it
+        at {NEES_INSTANTS} instants of each drive; at each, the mean over the drives of an honest estimate lies within the χ² band
+        in 95 % of all cases. The mean of all scans is beside it. An error of scale is none that the covariance knows of. A segment
+        is spurious when it was seen in at least three scans and most of it is farther than 0.15 m from everything that stands
+        still."
+    );
+    let title = "## Is the covariance honest?".into();
+    vec![title, paragraph(&about), paragraph(&dishonest(results)), honesty(results).to_string()]
+}
+
+/// Lines are no longer than this.
+const LINE: usize = 120;
+
+/// A paragraph, broken into lines once its numbers are in it.
+pub(super) fn paragraph(text: &str) -> String {
+    let mut broken = String::new();
+    let mut length = 0;
+    for word in text.split_whitespace() {
+        let width = word.chars().count();
+        let fits = length + 1 + width <= LINE;
+        if length > 0 {
+            broken.push(if fits { ' ' } else { '\n' });
+        }
+        length = if fits && length > 0 { length + 1 + width } else { width };
+        broken.push_str(word);
+    }
+    broken
 }
 
 #[cfg(test)]

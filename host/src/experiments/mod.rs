@@ -1,11 +1,17 @@
 //! The paper's experiments, and more: simulated buildings over many seeds, with what is wrong with the robot made worse.
-//! [`run`] measures, [`papers`] what the paper's configurations do, [`document`] writes the page, [`figures`] draws. Recorded logs are those of [`benchmark`](crate::benchmark).
+//! [`run`] measures, [`papers`] what the paper's configurations do, [`kidnapped`] what becomes of a robot that somebody lifts;
+//! [`limits`] are what is asked of the default. [`document`] writes the page, [`figures`] draws. Recorded logs are those of
+//! [`benchmark`](crate::benchmark).
 
 pub mod document;
 pub mod figures;
+pub mod kidnapped;
+pub mod kinds_page;
+pub mod limits;
 pub mod papers;
 mod papers_page;
 
+use std::ops::Range;
 use std::path::PathBuf;
 
 use rayon::prelude::*;
@@ -16,7 +22,7 @@ use crate::replay::{self, Replay, ReplayError};
 use crate::robot::Robot;
 use crate::sim::judge::{self, Judgement, TrajectoryErrors};
 use crate::sim::world::World;
-use crate::sim::{self, Drive, SimConfig};
+use crate::sim::{self, Drive, SimConfig, SimKind, UnitErrors};
 use crate::toml_file::FileError;
 
 /// A building of the experiments.
@@ -34,6 +40,9 @@ pub const BUILDINGS: [Building; 3] = [
     Building { name: "corridor", paper_measured_m: Some(0.234) },
     Building { name: "office", paper_measured_m: None },
 ];
+
+/// The worlds in which both kinds of errors are driven.
+pub const WORLDS: [&str; 7] = ["hall", "corridor", "office", "lab", "flat", "twins", "loop"];
 
 /// Two parallel walls and nothing else.
 pub const FEATURELESS: &str = "parallel";
@@ -88,17 +97,44 @@ impl Measured {
     }
 }
 
+/// What is driven.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Case {
+    /// Name of the world.
+    pub world: &'static str,
+    /// Kind of the errors.
+    pub kind: SimKind,
+    /// Index in [`CONDITIONS`].
+    pub condition: usize,
+}
+
+impl Case {
+    /// The usual errors of a kind.
+    pub const fn usual(world: &'static str, kind: SimKind) -> Self {
+        Self { world, kind, condition: 0 }
+    }
+
+    /// All that [`run`] drives.
+    fn all() -> impl Iterator<Item = Self> {
+        let usual = |world| SimKind::ALL.map(|kind| Self::usual(world, kind));
+        let ideal =
+            |world| (1..CONDITIONS.len()).map(move |c| Self { world, kind: SimKind::Ideal, condition: c });
+        let worse = BUILDINGS.into_iter().flat_map(move |building| ideal(building.name));
+        WORLDS.into_iter().flat_map(usual).chain(worse).chain([Self::usual(FEATURELESS, SimKind::Ideal)])
+    }
+}
+
 /// One simulated drive.
 #[derive(Clone, Debug)]
 pub struct Run {
-    /// Name of the world.
-    pub world: &'static str,
-    /// Index in [`CONDITIONS`].
-    pub condition: usize,
+    /// What was driven.
+    pub case: Case,
     /// What the default configuration made of it.
     pub default: Measured,
     /// What the wheels said.
     pub dead_reckoning: TrajectoryErrors,
+    /// What was wrong with the unit.
+    pub unit: UnitErrors,
 }
 
 /// File name and content of a figure.
@@ -108,9 +144,11 @@ pub type Figure = (String, String);
 #[derive(Debug)]
 pub struct Results {
     /// The seeds of the simulated drives.
-    pub seeds: std::ops::Range<u64>,
+    pub seeds: Range<u64>,
     /// Every simulated drive.
     pub runs: Vec<Run>,
+    /// Drives in which the robot was lifted.
+    pub kidnapped: Vec<kidnapped::Kidnapped>,
     /// The paper's configurations, and the default beside them.
     pub papers: Vec<papers::PaperRun>,
     /// RANSAC seeds of each drive.
@@ -125,7 +163,7 @@ pub struct Options {
     /// Folder of the worlds.
     pub worlds: PathBuf,
     /// The seeds of the simulated drives.
-    pub seeds: std::ops::Range<u64>,
+    pub seeds: Range<u64>,
     /// RANSAC seeds of each drive, for the paper's configurations.
     pub ransac_seeds: u64,
 }
@@ -149,28 +187,26 @@ pub enum ExperimentError {
 
 /// Number of steps that [`run`] reports.
 pub fn steps(options: &Options) -> usize {
-    let drives = BUILDINGS.len() * CONDITIONS.len() + 1;
-    drives * (options.seeds.end - options.seeds.start) as usize + papers::steps(options)
+    let seeds = (options.seeds.end - options.seeds.start) as usize;
+    Case::all().count() * seeds + papers::steps(options) + kidnapped::steps(options)
 }
 
 /// Runs everything. `progress` is called after each drive, from any thread.
 pub fn run(options: &Options, progress: impl Fn() + Sync) -> Result<Results, ExperimentError> {
     let mut jobs = Vec::new();
-    for name in BUILDINGS.map(|b| b.name).into_iter().chain([FEATURELESS]) {
-        let world = std::sync::Arc::new(options.world(name)?);
-        let conditions = if name == FEATURELESS { 1 } else { CONDITIONS.len() };
-        for condition in 0..conditions {
-            jobs.extend(options.seeds.clone().map(|seed| (name, world.clone(), condition, seed)));
-        }
+    for case in Case::all() {
+        let world = std::sync::Arc::new(options.world(case.world)?);
+        jobs.extend(options.seeds.clone().map(|seed| (case, world.clone(), seed)));
     }
     let runs = jobs
         .par_iter()
-        .map(|(name, world, condition, seed)| {
-            let run = simulated(name, world, *condition, *seed);
+        .map(|(case, world, seed)| {
+            let run = simulated(*case, world, *seed);
             progress();
             run
         })
         .collect::<Result<Vec<Run>, ReplayError>>()?;
+    let kidnapped = kidnapped::run(options, &progress)?;
     let papers = papers::run(options, &progress)?;
     let mut figures = Vec::new();
     for name in ["hall", "corridor", "office"] {
@@ -178,21 +214,21 @@ pub fn run(options: &Options, progress: impl Fn() + Sync) -> Result<Results, Exp
     }
     figures.extend(figures::papers(&options.world("corridor")?, options.seeds.start)?);
     let ransac_seeds = options.ransac_seeds;
-    Ok(Results { seeds: options.seeds.clone(), runs, papers, ransac_seeds, figures })
+    Ok(Results { seeds: options.seeds.clone(), runs, kidnapped, papers, ransac_seeds, figures })
 }
 
-/// One drive in a world, under a condition of [`CONDITIONS`].
-pub fn simulated(name: &'static str, world: &World, condition: usize, seed: u64) -> Result<Run, ReplayError> {
+/// One drive of a case in its world.
+pub fn simulated(case: Case, world: &World, seed: u64) -> Result<Run, ReplayError> {
     let robot = Robot::usual_for("simulated");
-    let mut errors = SimConfig::default();
-    for setting in CONDITIONS[condition].settings {
+    let mut errors = SimConfig::of(case.kind);
+    for setting in CONDITIONS[case.condition].settings {
         errors.set(setting).expect("the conditions are constants");
     }
     let drive = sim::drive(world, &robot, &errors, seed)?;
     let (default, replay) = measure(world, &drive, &robot, SlamConfig::default())?;
     let odometry = judge::in_world(&drive, replay.steps.iter().map(|s| s.odometry));
     let dead_reckoning = judge::trajectory_errors(&drive.truth, &odometry);
-    Ok(Run { world: name, condition, default, dead_reckoning })
+    Ok(Run { case, default, dead_reckoning, unit: drive.unit })
 }
 
 /// One configuration on one drive, and what it was judged by.

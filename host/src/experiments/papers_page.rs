@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use comfy_table::Table;
 
-use super::document::{corners_share, mean, metres, table};
+use super::document::{corners_share, lost, mean, metres, paragraph, table};
 use super::papers::{CONFIGURATIONS, PaperRun, SERIES};
 use super::{BUILDINGS, LOST_M, Measured, Results};
 use crate::configuration::Configuration;
@@ -54,7 +54,7 @@ impl<'a> Row<'a> {
     }
 
     fn lost(&self) -> String {
-        format!("{} of {}", self.measured().filter(|m| m.lost()).count(), self.measured().count())
+        lost(self.measured())
     }
 
     /// Trajectory errors drive by drive, those of the RANSAC seeds together.
@@ -162,25 +162,6 @@ pub fn trajectories(results: &Results) -> Table {
     table
 }
 
-/// Lines are no longer than this.
-const LINE: usize = 120;
-
-/// A paragraph, broken into lines once its numbers are in it.
-fn paragraph(text: &str) -> String {
-    let mut broken = String::new();
-    let mut length = 0;
-    for word in text.split_whitespace() {
-        let width = word.chars().count();
-        let fits = length + 1 + width <= LINE;
-        if length > 0 {
-            broken.push(if fits { ' ' } else { '\n' });
-        }
-        length = if fits && length > 0 { length + 1 + width } else { width };
-        broken.push_str(word);
-    }
-    broken
-}
-
 /// Paragraphs and tables, in the order of the page.
 pub fn section(results: &Results, images: &str) -> Vec<String> {
     let ours = "`--config paper` is what the paper's text says, equation by equation (`slam-core/src/paper/`, which reads in
@@ -190,7 +171,7 @@ pub fn section(results: &Results, images: &str) -> Vec<String> {
         by the points they stand for, and `paper-partial`, in addition, corrects of a singular system what it does
         determine.";
     let how = format!(
-        "The wheels are once as the robot file says, but for slip, as the paper's must have been, and once wrong as above.
+        "The wheels are once as the robot file says, but for slip, as the paper's must have been, and once wrong as those of the ideal kind.
         Each drive is replayed with {} RANSAC seeds; ± is the standard deviation over all drives and RANSAC seeds. The paper
         lays its map over the blueprint, so equation (11) is here with the map laid so, too: by the rotation and the
         translation with which most corners are found, and of these with the least error. A corner that is 0.35 m off is not
@@ -254,6 +235,19 @@ fn what_is_kept(results: &Results) -> String {
     let lost = three(&|c| row("corridor", c).lost()).join(", ");
     let hall = three(&|c| metres(row("hall", c).trajectory_m())).join(", ");
     let office = row("office", Configuration::PaperPartial).lost();
+    let worse: Vec<&str> = (BUILDINGS.iter().map(|b| b.name))
+        .filter(|world| {
+            let [partial, default] = [Configuration::PaperPartial, Configuration::Default];
+            row(world, default).trajectory_m() > row(world, partial).trajectory_m()
+        })
+        .collect();
+    let worse = match worse[..] {
+        [] => String::new(),
+        _ => format!(
+            "With these wheels the default does worse than `paper-partial` in: {}. ",
+            worse.join(", ")
+        ),
+    };
     let default = ["corridor", "hall"].map(|world| metres(row(world, Configuration::Default).trajectory_m()));
     format!(
         "`paper-partial` corrects the directions that are observed and leaves out the others: those in which the eigenvalue of
@@ -262,7 +256,7 @@ fn what_is_kept(results: &Results) -> String {
         `paper-weighted`, and {partial} m with `paper-partial`; track was lost in {lost} runs. In the hall it is, in this
         order, {hall} m. That is one step from the paper towards the default, which has {} m in the corridor and {} m in
         the hall: its prior leaves the way along a corridor to the wheels, too, but weighs them against what is seen instead
-        of cutting at a threshold. It is not the only step: among the office's small things and walking people
+        of cutting at a threshold. {worse}It is not the only step: among the office's small things and walking people
         `paper-partial` lost track in {office} runs. The same corridor,
         the same scans:",
         default[0], default[1]
