@@ -1,11 +1,11 @@
 //! The filter: pose, systematic errors of the odometry, and lines, with one covariance.
 //!
 //! Lines are placed by a robot that is not sure where it stands, and then say where the robot stands. Taken one by one, pose and
-//! lines would confirm each other's errors; their cross-covariance prevents that. Up to [`LINES`](crate::ekf::state::LINES) lines are
+//! lines would confirm each other's errors; their cross-covariance prevents that. Up to [`LINES`] lines are
 //! in the state, those seen last.
 //!
 //! It is an error-state filter: pose and lines are nominal values, held outside; measurements gather in the error state, and
-//! [`EkfSlam::commit`] injects it. Injection changes the frame in which errors are expressed, and the covariance is carried over by the
+//! `EkfSlam::commit` injects it. Injection changes the frame in which errors are expressed, and the covariance is carried over by the
 //! Jacobian of the reset (Solà 2017, section 6.3): a robot that has been moved turns about another point of the map, and a line that
 //! has been turned has another normal. Without that the filter gains information on the map's absolute position and heading, which
 //! are not observable.

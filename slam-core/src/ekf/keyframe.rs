@@ -61,6 +61,16 @@ impl Keyframe {
 }
 
 /// The filter's pose at its last commit, with no update pending: poses until the next one are relative to it.
+///
+/// Derivation. Tracking holds the lines fixed, so it gives the covariance L of a pose's error relative to the lines around it. The
+/// error that these lines have in common moves the anchor a and a later pose n alike, as one rigid body with the Jacobian J of
+/// compounding; relative to the lines their errors are independent of it. By the law of total covariance the filter's marginal is
+/// P_a = Λ + L_a with Λ of the lines, and the later pose has J·Λ·Jᵀ + L_n = J·P_a·Jᵀ + (L_n − L_a), the turn of L_a over some
+/// decimetres neglected. [`Self::carried`] is the first part, [`Self::grown`] the second: L_a is taken to have the shape of L_n, block by
+/// block, and where the pose is surer than at the anchor nothing is subtracted, which errs on the side of caution by L_a at the most.
+///
+/// Reference: Smith, Self and Cheeseman, "Estimating uncertain spatial relationships in robotics", 1990 (compounding of relative poses);
+/// Castellanos and Tardós, "Mobile Robot Localization and Map Building", 1999 (what features have in common is the frame's error).
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Anchor {
     /// Of `base` in `map`.

@@ -216,7 +216,7 @@ impl KeyframeUpdate {
 
     /// Updates the filter by the next measurements, `most` at most; false where none was left.
     ///
-    /// Work: for each of [`UpdateScope::All`] the square of the number of states, for the others that number.
+    /// Work: for each of `UpdateScope::All` the square of the number of states, for the others that number.
     pub fn advance(&mut self, most: usize, config: &EkfConfig, filter: &mut EkfSlam) -> bool {
         let end = self.queue.len().min(self.done.saturating_add(most));
         let next = self.queue.get(self.done..end).unwrap_or_default();

@@ -18,8 +18,8 @@
 //!           | 0   1           |              |  0  −1          |
 //! ```
 //!
-//! R, [`ObservationNoise`], is that of the observation alone. Who estimates the line together with the pose, the filter, has the
-//! line's covariance in its state and uses R. Who does not, the tracker, must count the line's error as noise: the [`Residual`] has
+//! R, `ObservationNoise`, is that of the observation alone. Who estimates the line together with the pose, the filter, has the
+//! line's covariance in its state and uses R. Who does not, the tracker, must count the line's error as noise: the `Residual` has
 //! R + J_line·P_line·J_lineᵀ.
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Vector2};
