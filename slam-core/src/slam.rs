@@ -153,6 +153,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let is_lost = self.state.state() == TrackingState::Lost;
         let tracked = self.tracker.locate(&scene, previous, prior, is_lost, watch);
         update.take(&tracked);
+        update.searched = tracked.searched;
         self.counters.searched = self.counters.searched.saturating_add(u32::from(tracked.searched));
         self.estimator.accept(&tracked.hypothesis);
         if let Some(left_out) = &tracked.left_out {
@@ -223,7 +224,8 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             mark_seen_through(&view, stamp.scan, nearby, map);
         }
         if let Some(openings) = openings {
-            let view = Some(&view).filter(|_| update.registration.committed);
+            // A scan that searches has enough to do.
+            let view = Some(&view).filter(|_| update.registration.committed && !update.searched);
             estimator.open_lines(openings, line_noise, nearby, view, map);
         }
         while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {

@@ -147,6 +147,8 @@ pub struct SlamUpdate {
     pub state: TrackingState,
     /// Whether the scan overruled the prediction: the odometry's increment was wild.
     pub odometry_left_out: bool,
+    /// Whether the prediction explained too little, and the pose was searched for.
+    pub searched: bool,
     /// Whether the odometry has been of no use for a while, so that the scanner is followed alone.
     pub odometry_useless: bool,
     /// What is wrong with the wheels, where that is known.
@@ -182,6 +184,7 @@ impl SlamUpdate {
             contradicted_share: 0.0,
             state,
             odometry_left_out: false,
+            searched: false,
             odometry_useless: false,
             wheel_fault: None,
             observability: Observability::BLIND,
