@@ -65,6 +65,8 @@ pub(crate) struct Estimator {
     anchor: Anchor,
     /// Where the robot was when lines were last opened.
     opened_from: Point2<f32>,
+    /// Whose turn is next to be looked at for openings: a rank among the lines nearby, modulo their number.
+    next_opened: u16,
     /// Scans before the one at hand.
     scans: u32,
     travelled_m: f32,
@@ -91,6 +93,7 @@ impl Estimator {
             update: KeyframeUpdate::default(),
             anchor: Anchor::default(),
             opened_from: Point2::origin(),
+            next_opened: 0,
             scans: 0,
             travelled_m: 0.0,
         }
@@ -200,38 +203,46 @@ impl Estimator {
     }
 
     /// The same of the filter's pose only: that of the scan at hand is known from the scan.
-    fn inflate_filter<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) {
-        self.commit(around);
+    /// Whether an update was committed with it.
+    fn inflate_filter<const N: usize>(
+        &mut self,
+        by: &Matrix3<f32>,
+        around: &mut Surroundings<'_, N>,
+    ) -> bool {
+        let committed = self.commit(around);
         if let Some(filter) = &mut self.filter {
             filter.inflate_pose(by, around.map);
         }
         self.keyframe.local_variance = self.keyframe.local_variance.plus(by);
         self.set_anchor();
+        committed
     }
 
     /// The filter goes on from where a scan says that overruled the prediction, so much less sure (covariance of (x, y, θ)): what
-    /// the odometry said since the keyframe does not count.
-    pub fn overrule<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) {
-        self.inflate_filter(by, around);
+    /// the odometry said since the keyframe does not count. Whether an update was committed with it, so that the map has changed.
+    pub fn overrule<const N: usize>(&mut self, by: &Matrix3<f32>, around: &mut Surroundings<'_, N>) -> bool {
+        let committed = self.inflate_filter(by, around);
         let moved = self.keyframe.map_from_base.inverse() * self.map_from_base;
         self.keyframe.since.before_from_after = normalized(&moved);
         self.restart_way();
+        committed
     }
 
     /// Completes the keyframe's update and injects the error state: pose and lines move at once, and lines that turn out to be one
-    /// wall are merged. Without a pending update nothing happens.
-    pub fn commit<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) {
-        let Some(config) = around.config.registration.ekf() else { return };
-        let Some(filter) = &mut self.filter else { return };
+    /// wall are merged. Without a pending update nothing happens, and it says so.
+    pub fn commit<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) -> bool {
+        let Some(config) = around.config.registration.ekf() else { return false };
+        let Some(filter) = &mut self.filter else { return false };
         let (sensor, near) = (SensorModel::of(around.config), &mut around.tracker.nearby);
         let Some([before, after]) = self.update.commit(&sensor, config, filter, around.map, near) else {
-            return;
+            return false;
         };
         // Merging has renumbered the map's segments.
         around.tracker.forget_shortlist();
         self.keyframe.map_from_base = after;
         self.set_anchor();
         self.map_from_base = after * before.inverse() * self.map_from_base;
+        true
     }
 
     /// Whether the scan at hand is to be taken into the map.
@@ -359,6 +370,10 @@ impl Estimator {
             return;
         }
         let stamp = self.stamp();
+        let first = usize::from(self.next_opened);
+        if view.is_some() {
+            self.next_opened = self.next_opened.wrapping_add(config.lines_per_scan.into());
+        }
         let here = self.map_from_base.translation.vector.into();
         let way = [core::mem::replace(&mut self.opened_from, here), here];
         for (rank, index) in nearby.iter().copied().map(usize::from).enumerate() {
@@ -366,7 +381,7 @@ impl Estimator {
                 continue;
             };
             let segment = entry.segment;
-            let view = view.filter(|_| config.looks_at(rank, nearby.len(), stamp.scan));
+            let view = view.filter(|_| config.looks_at(rank, nearby.len(), first));
             let Some(opening) = opening(&segment, way, view, config) else { continue };
             let parts = opening.cut(&segment);
             match &mut self.filter {

@@ -153,13 +153,13 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         let is_lost = self.state.state() == TrackingState::Lost;
         let tracked = self.tracker.locate(&scene, previous, prior, is_lost, watch);
         update.take(&tracked);
-        update.searched = tracked.searched;
-        self.counters.searched = self.counters.searched.saturating_add(u32::from(tracked.searched));
         self.estimator.accept(&tracked.hypothesis);
         if let Some(left_out) = &tracked.left_out {
             let (estimator, mut around) = self.estimator();
-            estimator.overrule(left_out, &mut around);
-            // Fusing walls may have renumbered the map's segments.
+            if !estimator.overrule(left_out, &mut around) {
+                return;
+            }
+            // The commit has moved lines, and merging may have renumbered them.
             let scene =
                 Scene { observed: self.frontend.segments(), map: self.map.segments(), config: &self.config };
             let (pose, covariance) = (self.estimator.pose(), tracked.hypothesis.covariance);
@@ -227,6 +227,9 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             // A scan that searches has enough to do.
             let view = Some(&view).filter(|_| update.registration.committed && !update.searched);
             estimator.open_lines(openings, line_noise, nearby, view, map);
+        }
+        if !update.registration.keyframe {
+            return;
         }
         while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {
             estimator.forget_line(index, map);

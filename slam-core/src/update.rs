@@ -58,6 +58,7 @@ impl Counters {
         add(&mut self.loops_closed, u32::from(update.closure.is_some()));
         add(&mut self.crowded_out, update.extraction.crowded_out);
         add(&mut self.odometry_left_out, u32::from(update.odometry_left_out));
+        add(&mut self.searched, u32::from(update.searched));
         add(&mut self.lost, u32::from(update.state == TrackingState::Lost));
     }
 }
@@ -203,5 +204,6 @@ impl SlamUpdate {
         self.support = tracked.hypothesis.score;
         self.observability = tracked.hypothesis.observability;
         self.odometry_left_out = tracked.left_out.is_some();
+        self.searched = tracked.searched;
     }
 }

@@ -13,7 +13,8 @@ use crate::geometry::pose::cross;
 use crate::geometry::segment::Segment;
 use crate::map::visibility::View;
 
-/// Settings of cutting.
+/// Settings of cutting. Chosen on the simulated office and flat, seeds 1 to 3; that recorded logs come out as before was checked on aces,
+/// mit-csail, fr079, exp1, exp3 and csail.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -22,18 +23,17 @@ pub struct OpeningConfig {
     pub min_width_m: f32,
     /// Width that the robot needs where it drives through, metres.
     pub passage_m: f32,
-    /// Lines whose beams are looked up in each keyframe; they take turns.
+    /// Lines whose beams are looked up after each keyframe; they take turns.
     pub lines_per_scan: u8,
     /// A line is cut once this many scans have seen it; until then it is only forgotten as a whole.
     pub min_hits: u16,
 }
 
 impl OpeningConfig {
-    /// Whether it is the turn of the line with this rank among so many.
-    pub(crate) fn looks_at(&self, rank: usize, lines: usize, scan: u32) -> bool {
-        let turn = usize::from(self.lines_per_scan);
-        let begin = (scan as usize).wrapping_mul(turn) % lines.max(1);
-        (rank + lines - begin) % lines.max(1) < turn
+    /// Whether it is the turn of the line with this rank among so many; `first`, modulo their number, is whose turn is first.
+    pub(crate) fn looks_at(&self, rank: usize, lines: usize, first: usize) -> bool {
+        let lines = lines.max(1);
+        (rank + lines - first % lines) % lines < usize::from(self.lines_per_scan)
     }
 }
 
@@ -206,9 +206,9 @@ mod tests {
         let config = OpeningConfig { lines_per_scan: 3, ..config() };
         for lines in [1usize, 3, 7, 20] {
             let mut looked_at = std::vec![0; lines];
-            for scan in 0..lines as u32 {
+            for first in (0..3 * lines.div_ceil(3)).step_by(3) {
                 let now: std::vec::Vec<usize> =
-                    (0..lines).filter(|k| config.looks_at(*k, lines, scan)).collect();
+                    (0..lines).filter(|k| config.looks_at(*k, lines, first)).collect();
                 assert_eq!(now.len(), lines.min(3));
                 now.into_iter().for_each(|k| looked_at[k] += 1);
             }

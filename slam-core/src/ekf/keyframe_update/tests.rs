@@ -95,18 +95,24 @@ struct Keyframe {
     update: KeyframeUpdate,
 }
 
+/// Four walls, seen from the origin, and a robot that is no longer sure where it is.
+fn in_a_room<const N: usize>() -> ([Segment; 4], SegmentMap<N>, EkfSlam) {
+    let (mut map, mut filter) = (SegmentMap::<N>::new(), filter());
+    let known = [
+        wall((3.0, -2.0), (3.0, 2.0)),
+        wall((-3.0, 2.0), (3.0, 2.0)),
+        wall((-3.0, -2.0), (-3.0, 2.0)),
+        wall((-3.0, -2.0), (3.0, -2.0)),
+    ];
+    run(&mut map, &mut filter, &known, &[], 1);
+    filter.inflate_pose(&(Matrix3::identity() * 1e-3), &mut map);
+    (known, map, filter)
+}
+
 impl Keyframe {
     /// The robot is at `truth`, believes in the origin, and has found `tracked`.
     fn new(truth: f32, tracked: f32) -> Self {
-        let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
-        let known = [
-            wall((3.0, -2.0), (3.0, 2.0)),
-            wall((-3.0, 2.0), (3.0, 2.0)),
-            wall((-3.0, -2.0), (-3.0, 2.0)),
-            wall((-3.0, -2.0), (3.0, -2.0)),
-        ];
-        run(&mut map, &mut filter, &known, &[], 1);
-        filter.inflate_pose(&(Matrix3::identity() * 1e-3), &mut map);
+        let (known, mut map, mut filter) = in_a_room::<8>();
         let base_from_map = pose(truth, 0.0, 0.0).inverse();
         let mut seen: StdVec<Segment> = known.iter().map(|s| s.transformed(&base_from_map)).collect();
         let unknown = wall((2.0, -1.0), (2.0, -0.5));
@@ -226,15 +232,7 @@ fn a_pair_that_does_not_fit_changes_nothing() {
 /// fifth is in the state, and as far off as the robot was. Returns map, filter, the new walls as they were seen and the pose at the
 /// commit.
 fn five_walls_and_two<const N: usize>() -> (SegmentMap<N>, EkfSlam, [Segment; 2], Isometry2<f32>) {
-    let (mut map, mut filter) = (SegmentMap::<N>::new(), filter());
-    let known = [
-        wall((3.0, -2.0), (3.0, 2.0)),
-        wall((-3.0, 2.0), (3.0, 2.0)),
-        wall((-3.0, -2.0), (-3.0, 2.0)),
-        wall((-3.0, -2.0), (3.0, -2.0)),
-    ];
-    run(&mut map, &mut filter, &known, &[], 1);
-    filter.inflate_pose(&(Matrix3::identity() * 1e-3), &mut map);
+    let (known, mut map, mut filter) = in_a_room::<N>();
     let base_from_map = pose(0.03, 0.0, 0.0).inverse();
     run(&mut map, &mut filter, &[wall((-1.0, 1.0), (-1.0, 1.5)).transformed(&base_from_map)], &[], 2);
     let unknown = [wall((2.0, -1.0), (2.0, -0.5)), wall((1.0, -1.5), (1.5, -1.0))];
