@@ -82,6 +82,7 @@ pub mod map;
 pub mod mapper;
 pub mod odometry;
 pub mod paper;
+pub mod places;
 pub mod sensor;
 pub mod slam;
 pub mod tracking;
