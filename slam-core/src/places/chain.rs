@@ -48,7 +48,7 @@ impl Anchor {
 }
 
 /// How well the front end was supported since the last anchor.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 pub struct Support {
     /// Way driven, metres, …
     way_m: f32,
@@ -66,6 +66,9 @@ pub struct Support {
 const LOW_SUPPORT: f32 = 0.7;
 
 impl Support {
+    /// Nothing driven.
+    pub const NONE: Self = Self { way_m: 0.0, turn_rad: 0.0, corridor_m: 0.0, blind_m: 0.0, is_low: false };
+
     /// Takes in a motion, and what the scan after it made of the pose.
     pub fn add(&mut self, motion: &Increment, verdict: Verdict, support: f32) {
         self.way_m += motion.distance_m;
@@ -192,7 +195,7 @@ mod tests {
     fn what_was_not_seen_makes_the_chain_unsure() {
         let motion = Increment::from_motion(pose(0.5, 0.0, 0.1));
         let of = |verdict, score| {
-            let mut support = Support::default();
+            let mut support = Support::NONE;
             (0..8).for_each(|_| support.add(&motion, verdict, score));
             support.variances(1.0)
         };
