@@ -165,9 +165,10 @@ fn run_sized<const BEAMS: usize>(
         let update = mapper.scan_with(middle_us, &scan.ranges_mm, &motion);
         let took = started.elapsed();
         odometry *= motion.since_previous.before_from_after;
-        if let Some(closure) = &update.closure {
+        if update.closure.is_some() {
+            let places = mapper.slam().places();
             for step in &mut steps {
-                step.pose_in_final_map = closure.bend(step.update.way_m) * step.pose_in_final_map;
+                step.pose_in_final_map = places.moved_pose(step.update.way_m, &step.pose_in_final_map);
             }
         }
         distance_m += match steps.last() {

@@ -19,9 +19,8 @@ use crate::ekf::keyframe_update::{
 };
 use crate::ekf::line_map::LineMap;
 use crate::geometry::line_noise::LineNoise;
-use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covariance};
+use crate::geometry::pose::{heading, is_finite, normalized, perpendicular, rotate_covariance};
 use crate::geometry::segment::Segment;
-use crate::loop_closure::Closure;
 use crate::map::SegmentMap;
 use crate::map::openings::{OpeningConfig, opening};
 use crate::map::visibility::View;
@@ -30,6 +29,7 @@ use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
 use crate::odometry::track::ScanMotion;
 use crate::paper::end_points::register_end_points;
+use crate::places::Places;
 use crate::tracking::correction::Prior;
 use crate::tracking::{Hypothesis, Tracker, TrackingState};
 use crate::update::SlamUpdate;
@@ -129,11 +129,6 @@ impl Estimator {
         self.anchor.carried(&self.map_from_base)
             + self.anchor.grown(&self.local_covariance)
             + Matrix3::from_diagonal(&Vector3::new(in_common, in_common, 0.0))
-    }
-
-    /// Covariance of the keyframe's pose by the filter, if there is one.
-    pub fn filter_covariance(&self) -> Option<Matrix3<f32>> {
-        self.filter.as_ref().map(EkfSlam::pose_covariance)
     }
 
     /// Systematic errors of the odometry as learnt so far.
@@ -273,8 +268,8 @@ impl Estimator {
             }
             RegistrationConfig::Ekf(ekf) => {
                 let is_due = self.keyframe_is_due(&config.registration);
-                if update.closure.is_some() || is_due && self.admits(update, &ekf.keyframes, around) {
-                    self.take_keyframe(update.closure.as_ref(), ekf, around)
+                if is_due && self.admits(update, &ekf.keyframes, around) {
+                    self.take_keyframe(ekf, around)
                 } else {
                     self.go_on_with_keyframe(ekf, around)
                 }
@@ -296,19 +291,15 @@ impl Estimator {
         update.state != TrackingState::Lost && (update.support >= config.min_score || waited || at_start)
     }
 
-    /// Makes the scan at hand the keyframe. The filter is updated from the next scan on; at once where keyframes follow each other or
-    /// a loop was closed.
+    /// Makes the scan at hand the keyframe. The filter is updated from the next scan on; at once where keyframes follow each
+    /// other.
     fn take_keyframe<const N: usize>(
         &mut self,
-        closure: Option<&Closure>,
         config: &EkfConfig,
         around: &mut Surroundings<'_, N>,
     ) -> RegistrationReport {
         let in_a_row = self.keyframe.scans <= 1;
-        let advanced = self.advance(around);
-        // A closed loop has moved the prediction with the map.
-        let carried = closure.map(|closure| closure.closed * closure.drifted.inverse());
-        let prior = carried.map_or(advanced, |closed_from_drifted| closed_from_drifted * advanced);
+        let prior = self.advance(around);
         self.keyframe = Keyframe::at(prior, LocalVariance::of(&self.local_covariance));
         let at = LinearizationPoint { prior, pose: self.map_from_base };
         let seen = Observed {
@@ -319,7 +310,7 @@ impl Estimator {
         };
         let Some(filter) = &mut self.filter else { return RegistrationReport::default() };
         let mut report = self.update.begin(&seen, &at, config, filter, around.map);
-        if in_a_row || closure.is_some() {
+        if in_a_row {
             self.commit(around);
             report.committed = true;
         }
@@ -339,6 +330,39 @@ impl Estimator {
             report.committed = true;
         }
         report
+    }
+
+    /// Moves with the places, which loops have corrected: the pose, the filter and what was seen on the last `local_m` by `moved`, as
+    /// one, so that tracking notices nothing; older lines with the places around which they were seen. Those leave the filter's state:
+    /// what they have in common with the pose is not known any more.
+    pub fn carry<const N: usize, const P: usize>(
+        &mut self,
+        moved: &Isometry2<f32>,
+        places: &Places<P>,
+        around: &mut Surroundings<'_, N>,
+    ) {
+        let Some(config) = around.config.places else { return };
+        self.commit(around);
+        for index in 0..around.map.segments().len() {
+            let Some(entry) = around.map.get_mut(index) else { continue };
+            let is_local = self.travelled_m - entry.seen_at_m <= config.local_m;
+            let by = if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.segment.midpoint()) };
+            let segment = entry.segment.transformed(&by);
+            if segment.is_finite() {
+                entry.segment = segment;
+            }
+            if let Some(filter) = self.filter.as_mut().filter(|_| !is_local) {
+                filter.decouple_line(index, around.map);
+            }
+        }
+        if let Some(filter) = &mut self.filter {
+            filter.turn_pose(heading(moved));
+        }
+        self.local_covariance = rotate_covariance(moved, &self.local_covariance);
+        self.keyframe.map_from_base = normalized(&(moved * self.keyframe.map_from_base));
+        self.map_from_base = normalized(&(moved * self.map_from_base));
+        self.set_anchor();
+        self.restart_way();
     }
 
     /// Forgets a line of the map.
@@ -594,6 +618,32 @@ mod tests {
         let (estimator, mut around) = robot.with(&[]);
         estimator.commit(&mut around);
         assert_eq!(components(&robot.estimator.pose()), components(&after));
+    }
+
+    #[test]
+    fn what_is_local_moves_as_one_and_old_lines_stay_with_their_places() {
+        let mut robot = Robot::new(SlamConfig::default());
+        robot.see(&[wall()]);
+        (0..20).for_each(|_| assert!(robot.go(1.0, 0.0, 0.0)));
+        robot.see(&[wall()]);
+        let (estimator, mut around) = robot.with(&[]);
+        estimator.commit(&mut around);
+        let seen = |robot: &Robot| {
+            let base_from_map = robot.estimator.pose().inverse();
+            base_from_map * robot.map.segments()[1].segment.midpoint()
+        };
+        let (old, new) = (robot.map.segments()[0].segment, seen(&robot));
+        let before = (robot.estimator.pose(), robot.estimator.local().covariance.determinant());
+        let moved = pose(0.5, -0.3, 0.2);
+        let (estimator, mut around) = robot.with(&[]);
+        estimator.carry(&moved, &Places::<96>::new(), &mut around);
+        assert_eq!(robot.map.segments()[0].segment.midpoint(), old.midpoint(), "no place has moved");
+        assert!((seen(&robot) - new).norm() < 1e-5);
+        assert!(
+            (robot.estimator.pose().translation.vector - (moved * before.0).translation.vector).norm() < 1e-5
+        );
+        let determinant = robot.estimator.local().covariance.determinant();
+        assert!((determinant - before.1).abs() <= 1e-2 * before.1, "{determinant} {}", before.1);
     }
 
     #[test]

@@ -8,9 +8,9 @@
 //! [`SlamConfig::paper_partial`].
 //!
 //! ```text
-//!  ranges_mm ──► frontend ──────────► tracking ◄─► loop closure ──► registration ──► map
-//!                deskew, extraction   association,                  ekf: EkfSlam      │
-//!                  ▲     [Segment]    correction, [Pair]             ▲ │          forgetting
+//!  ranges_mm ──► frontend ──────────► tracking ───────────────────► registration ──► map ◄──► places
+//!                deskew, extraction   association,                  ekf: EkfSlam      │         chain, finding,
+//!                  ▲     [Segment]    correction, [Pair]             ▲ │          forgetting     solver
 //!                  │                  heading search                 │ │              │
 //!  ticks ──► odometry ──► predict ───────┴──► pose ──────────────────┘ │              │
 //!            [OdometryTrack]  ▲                                        ▼              ▼
@@ -18,8 +18,8 @@
 //!                  └── monitor, noise and wheel faults, by what the scan says
 //! ```
 //!
-//! [`Slam::process_scan`](slam::Slam::process_scan) reads like that drawing: predict, observe, track, close the loop, monitor the
-//! odometry, judge the state, register, forget. Each stage is a folder of its own and can be used without it.
+//! [`Slam::process_scan`](slam::Slam::process_scan) reads like that drawing: predict, observe, track, monitor the odometry, judge
+//! the state, register, forget, keep the places. Each stage is a folder of its own and can be used without it.
 //!
 //! The correction finds which segment is which, and a pose good enough to make everything linear. Of the scans that are
 //! [`keyframe`](ekf::keyframe)s the filter then has the last word on the pose, on the odometry's errors and on the lines,
@@ -33,7 +33,7 @@
 //!
 //! # Reading order
 //! [`mapper`] for the one door, [`slam`] for the whole, [`geometry::segment`] for what a line is, [`sensor`] and [`odometry`]
-//! for what comes in, then the stages in the order of the drawing: [`frontend`], [`tracking`], [`ekf`] and [`map`], and [`paper`] for
+//! for what comes in, then the stages in the order of the drawing: [`frontend`], [`tracking`], [`ekf`], [`map`] and [`places`], and [`paper`] for
 //! the paper's own. [`config`] has every constant and where it comes from.
 //!
 //! # Example
@@ -77,11 +77,11 @@ pub mod ekf;
 mod estimator;
 pub mod frontend;
 pub mod geometry;
-pub mod loop_closure;
 pub mod map;
 pub mod mapper;
 pub mod odometry;
 pub mod paper;
+pub mod places;
 pub mod sensor;
 pub mod slam;
 pub mod tracking;

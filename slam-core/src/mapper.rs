@@ -67,14 +67,14 @@ pub struct MapperCounters {
     pub counters_restarted: u32,
 }
 
-/// Odometry and scans in, poses out. Room for `N` map segments, `BEAMS` beams and `K` odometry samples, which must span a scan
+/// Odometry and scans in, poses out. Room for `N` map segments, `BEAMS` beams, `P` places and `K` odometry samples, which must span a scan
 /// and its way to here: 64 at 200 Hz are 0.32 s. Longer gaps between scans are bridged.
 ///
 /// The map's origin is where the robot was at the first scan, or at the first sample if it coasts before.
 ///
 /// RAM: [`Mapper::BYTES`], that of [`Slam`] and 48 bytes for each sample.
-pub struct Mapper<const N: usize, const K: usize, const BEAMS: usize = 682> {
-    slam: Slam<N, BEAMS>,
+pub struct Mapper<const N: usize, const K: usize, const BEAMS: usize = 682, const P: usize = 96> {
+    slam: Slam<N, BEAMS, P>,
     drive: Option<DifferentialDrive>,
     track: OdometryTrack<K>,
     last_ticks: Option<WheelTicks>,
@@ -88,13 +88,13 @@ pub struct Mapper<const N: usize, const K: usize, const BEAMS: usize = 682> {
     counters: MapperCounters,
 }
 
-impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
+impl<const N: usize, const K: usize, const BEAMS: usize, const P: usize> Mapper<N, K, BEAMS, P> {
     /// Size in RAM.
     pub const BYTES: usize = core::mem::size_of::<Self>();
 
     /// An empty map. Without a drive there is no use in ticks, only in motions.
     pub fn new(config: SlamConfig, drive: impl Into<Option<DifferentialDrive>>) -> Result<Self, ConfigError> {
-        Slam::<N, BEAMS>::check(&config)?;
+        Slam::<N, BEAMS, P>::check(&config)?;
         let mut mapper = Self::blank(config, drive.into());
         mapper.slam.prepare();
         Ok(mapper)
@@ -106,7 +106,7 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
         config: SlamConfig,
         drive: impl Into<Option<DifferentialDrive>>,
     ) -> Result<&mut Self, ConfigError> {
-        Slam::<N, BEAMS>::check(&config)?;
+        Slam::<N, BEAMS, P>::check(&config)?;
         let mapper = place.write(Self::blank(config, drive.into()));
         mapper.slam.prepare();
         Ok(mapper)
@@ -134,7 +134,7 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
     }
 
     /// Map, pose and counters.
-    pub fn slam(&self) -> &Slam<N, BEAMS> {
+    pub fn slam(&self) -> &Slam<N, BEAMS, P> {
         &self.slam
     }
 
@@ -301,7 +301,7 @@ impl<const N: usize, const K: usize, const BEAMS: usize> Mapper<N, K, BEAMS> {
     fn learn_delay(&mut self, at_us: u64, update: &SlamUpdate) {
         let config = self.slam.config();
         let Some(delay) = config.odometry.delay else { return };
-        let left_out = update.odometry_left_out || update.odometry_useless || update.closure.is_some();
+        let left_out = update.odometry_left_out || update.odometry_useless;
         let fixed = update.observability.verdict == Verdict::Full
             && update.support >= config.state.good_score
             && !left_out;

@@ -1,18 +1,19 @@
 //! The only stateful wiring: a scan and a motion go in, a pose and a map come out.
 
 mod access;
+mod recovery;
 
-use nalgebra::{Isometry2, Matrix3};
+use nalgebra::Isometry2;
 
 use crate::config::SlamConfig;
 use crate::estimator::{Estimator, Surroundings};
 use crate::frontend::Frontend;
-use crate::loop_closure::LoopCloser;
+use crate::map::SegmentMap;
 use crate::map::visibility::{View, is_gone, mark_seen_through};
-use crate::map::{MapSegment, SegmentMap};
 use crate::odometry::Increment;
 use crate::odometry::health::{OdometryHealth, ScanEvidence};
 use crate::odometry::track::ScanMotion;
+use crate::places::{Places, Visit};
 use crate::sensor::scan::Scan;
 use crate::tracking::correction::Prior;
 use crate::tracking::state::StateMonitor;
@@ -20,22 +21,22 @@ use crate::tracking::tracker::Scene;
 use crate::tracking::{Hypothesis, Tracker, TrackingState};
 pub use crate::update::{Counters, ScanRejection, SlamUpdate, Stage};
 
-/// Map, pose and working memory: room for `N` map segments and `BEAMS` beams.
+/// Map, pose and working memory: room for `N` map segments, `BEAMS` beams and `P` places.
 ///
-/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 16 for each beam and 30 KiB.
-pub struct Slam<const N: usize, const BEAMS: usize = 682> {
+/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 16 for each beam, 172 for each place and 47 KiB.
+pub struct Slam<const N: usize, const BEAMS: usize = 682, const P: usize = 96> {
     config: SlamConfig,
     map: SegmentMap<N>,
     estimator: Estimator,
     frontend: Frontend<BEAMS>,
     tracker: Tracker<N>,
-    loops: LoopCloser,
+    places: Places<P>,
     odometry: OdometryHealth,
     state: StateMonitor,
     counters: Counters,
 }
 
-impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
+impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Takes in one scan and the motion that led to it.
     ///
     /// Never panics, whatever the numbers: what cannot be used is counted, see [`Counters`] and
@@ -62,11 +63,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         if update.rejected.is_none() {
             self.observe(scan, motion, &mut update, watch);
             self.track(&previous, &prior, &mut update, watch);
-            self.close_loop(&mut update, watch);
             self.monitor_odometry(&by_odometry, &previous, &mut update);
             self.judge_state(scan, &motion.since_previous, &mut update);
             self.register(&mut update, watch);
             self.forget(scan, &update);
+            self.keep_places(&by_odometry, &mut update);
         }
         self.finish(&mut update);
         update
@@ -79,32 +80,6 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         self.counters.count_motion(is_usable);
         self.counters.coasted = self.counters.coasted.saturating_add(1);
         self.estimator.pose()
-    }
-
-    /// Takes up a map made before, with the robot at a pose in it that is taken as certain. Segments beyond the capacity are left out, and
-    /// counted as refused.
-    pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {
-        self.map.take_up(map);
-        self.estimator.begin_at(map_from_base, &self.config);
-    }
-
-    /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.
-    pub fn loosen(&mut self, by: &Matrix3<f32>) {
-        let (estimator, mut around) = self.estimator();
-        estimator.inflate(by, &mut around);
-    }
-
-    /// Puts in order what a reset in the middle of [`Self::process_scan`] may have left half done. Segments that are not finite leave
-    /// the map, and the filter begins anew with what the map says. False where the pose is lost: nothing can be
-    /// kept then.
-    pub fn recover(&mut self) -> bool {
-        if !self.estimator.recover_pose() {
-            return false;
-        }
-        self.map.forget_broken();
-        self.estimator.begin_anew(&self.config);
-        self.loops = LoopCloser::default();
-        true
     }
 
     /// The estimator, and what it works with.
@@ -167,17 +142,6 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
     }
 
-    /// Recognises old parts of the map from which the pose has drifted, and closes the loop.
-    fn close_loop(&mut self, update: &mut SlamUpdate, watch: &mut impl FnMut(Stage)) {
-        let Some(loop_config) = self.config.loop_closure else { return };
-        let Self { config, odometry, frontend, map, tracker, estimator, loops, .. } = self;
-        let mut around = Surroundings { config, odometry, observed: frontend.segments(), map, tracker };
-        if let Some((closure, observability)) = loops.close(&loop_config, estimator, &mut around, watch) {
-            (update.closure, update.observability) = (Some(closure), observability);
-            estimator.restart_way();
-        }
-    }
-
     /// The odometry against the scanner, and how noisy both are.
     fn monitor_odometry(&mut self, motion: &Increment, previous: &Isometry2<f32>, update: &mut SlamUpdate) {
         let (pose, bias) = (self.estimator.pose(), self.estimator.odometry_bias());
@@ -188,7 +152,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             support: update.support,
             observability: &update.observability,
             residual_m: update.residual_m,
-            jumped: update.odometry_left_out || update.closure.is_some(),
+            jumped: update.odometry_left_out,
             bias: &bias,
         };
         if let Some((line_noise, noise)) = self.odometry.update(motion, &evidence, &self.config) {
@@ -233,6 +197,32 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
         }
         while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {
             estimator.forget_line(index, map);
+        }
+    }
+
+    /// Takes the scan into the places, and does some of their work. Where loops have corrected them, everything moves with them.
+    fn keep_places(&mut self, motion: &Increment, update: &mut SlamUpdate) {
+        let Some(config) = self.config.places else { return };
+        let visit = Visit {
+            pose: self.estimator.pose(),
+            motion: *motion,
+            way_m: self.estimator.travelled_m(),
+            verdict: update.observability.verdict,
+            support: update.support,
+            map: self.map.segments(),
+        };
+        self.places.visit(&visit, &config);
+        for _ in 0..Places::<P>::steps(motion) {
+            // One at most for each scan: who asks how the places have moved must not miss any.
+            update.closure = self.places.step(&config);
+            if let Some(closure) = update.closure {
+                let Self { config, odometry, frontend, map, tracker, estimator, places, .. } = self;
+                let mut around =
+                    Surroundings { config, odometry, observed: frontend.segments(), map, tracker };
+                estimator.carry(&closure.moved, places, &mut around);
+                update.predicted = closure.moved * update.predicted;
+                break;
+            }
         }
     }
 

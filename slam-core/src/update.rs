@@ -5,9 +5,9 @@ use nalgebra::{Isometry2, Matrix3};
 use crate::ekf::keyframe_update::RegistrationReport;
 use crate::frontend::deskew::DeskewReport;
 use crate::frontend::extraction::ExtractionReport;
-use crate::loop_closure::Closure;
 use crate::map::MapCounters;
 use crate::odometry::wheel_faults::WheelFault;
+use crate::places::Closure;
 use crate::sensor::scan::{Scan, ScanGeometry};
 use crate::tracking::TrackingState;
 use crate::tracking::correction::{Observability, Prior};
@@ -30,7 +30,7 @@ pub struct Counters {
     pub uncorrected: u32,
     /// Moves by odometry alone, without a scan.
     pub coasted: u32,
-    /// Loops closed.
+    /// Times that places were corrected by loops.
     pub loops_closed: u32,
     /// Segments that one scan had too many.
     pub crowded_out: u32,
@@ -158,7 +158,7 @@ pub struct SlamUpdate {
     pub observability: Observability,
     /// Way driven until now, metres.
     pub way_m: f32,
-    /// Set when this scan closed a loop, and with it the map was bent.
+    /// Set when places were corrected by loops, and the map and the pose with them.
     pub closure: Option<Closure>,
     /// Set when the scan was not used. The motion still was.
     pub rejected: Option<ScanRejection>,

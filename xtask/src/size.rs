@@ -11,10 +11,10 @@ use crate::firmware::{self, Build};
 use crate::run::{announce, cargo, step, target_folder};
 
 /// Flash that the firmware may take: code, constants, and what variables begin with.
-const FLASH_BUDGET: u64 = 168 * 1024;
-/// RAM that it may take, the map for 512 segments among it, less the stack, which is measured as it runs: a test of the
-/// emulated board holds both together to 96 KiB.
-const RAM_BUDGET: u64 = (96 - 9) * 1024;
+const FLASH_BUDGET: u64 = 208 * 1024;
+/// RAM that it may take, the map for 512 segments and 96 places among it, less the stack, which is measured as it runs: a test of the
+/// emulated board holds both together to 132 KiB of 192.
+const RAM_BUDGET: u64 = (132 - 10) * 1024;
 
 /// What a report prints of an ELF file.
 struct Sizes {
@@ -69,7 +69,7 @@ pub fn summary() -> anyhow::Result<String> {
         sizes.sections.iter().filter(|s| of(s)).map(|s| s.1).sum::<u64>() as f64 / 1024.0
     };
     Ok(format!(
-        "| firmware | KiB | budget |\n|---|---|---|\n| flash | {:.1} | {} |\n| variables, a map for 512 segments among them | {:.1} | {} |\n",
+        "| firmware | KiB | budget |\n|---|---|---|\n| flash | {:.1} | {} |\n| variables, a map for 512 segments and 96 places among them | {:.1} | {} |\n",
         sum(|s| s.2),
         FLASH_BUDGET / 1024,
         sum(|s| s.3),

@@ -151,10 +151,10 @@ fn replayed(found: &Found, noise: &Noise, remarks: &mut Vec<String>) -> Result<M
     let trajectory = reference.as_ref().map(|(_, trajectory)| trajectory.as_slice());
     // Relations were checked by hand; references have errors of their own.
     let (measure, main): (_, MainMeasure<'_>) = match (&relations, trajectory) {
-        (Some(relations), _) => ("relations, m", &|r| online_relation_error_m(found, r, relations)),
-        (None, Some(trajectory)) => {
-            ("ATE, m", &|r| score::absolute_trajectory_error(&stamped(r, |s| &s.pose), trajectory))
-        }
+        (Some(relations), _) => ("relations, m", &|r| final_relation_error_m(found, r, relations)),
+        (None, Some(trajectory)) => ("ATE, m", &|r| {
+            score::absolute_trajectory_error(&stamped(r, |s| &s.pose_in_final_map), trajectory)
+        }),
         (None, None) => ("", &|_| None),
     };
     let firmness = match main(&replay) {
@@ -223,8 +223,8 @@ fn laser_m(found: &Found, replay: &Replay) -> f64 {
     if of_laser { (laser_m * 1e6).round() * 1e-6 } else { 0.0 }
 }
 
-fn online_relation_error_m(found: &Found, replay: &Replay, relations: &[Relation]) -> Option<f64> {
-    let poses = at_laser(&stamped(replay, |s| &s.pose), laser_m(found, replay));
+fn final_relation_error_m(found: &Found, replay: &Replay, relations: &[Relation]) -> Option<f64> {
+    let poses = at_laser(&stamped(replay, |s| &s.pose_in_final_map), laser_m(found, replay));
     Some(score::relation_errors(&poses, relations)?.errors.trans_m)
 }
 

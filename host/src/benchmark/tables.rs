@@ -195,7 +195,7 @@ fn firm_rows(rows: &[Row]) -> Vec<[String; 5]> {
     .collect()
 }
 
-const FIRM: [&str; 5] = ["log", "online error of", "plain", "median with noise", "worst with noise"];
+const FIRM: [&str; 5] = ["log", "final error of", "plain", "median with noise", "worst with noise"];
 
 /// The same for the page; `None` where no log was replayed with noise.
 pub(super) fn firm_table(rows: &[Row]) -> Option<Table> {

@@ -19,7 +19,7 @@ use crate::ekf::slots::Slots;
 use crate::ekf::state::{Covariance, FIRST_LINE, LINES, ODOMETRY, POSE, STATES, line_states};
 use crate::geometry::line_noise::with_variances;
 use crate::geometry::line_observation::by_pose;
-use crate::geometry::math::{VARIANCE_FLOOR, max, within};
+use crate::geometry::math::{VARIANCE_FLOOR, max, sin_cos, within};
 use crate::geometry::pose::{components, pose};
 use crate::geometry::segment::Segment;
 use crate::map::SegmentMap;
@@ -139,6 +139,25 @@ impl EkfSlam {
         (POSE..ODOMETRY).for_each(|state| self.covariance.zero_state(state));
         let most = Vector3::from(MAX_POSE_VARIANCE);
         self.covariance.set_block(POSE, &Matrix3::from_diagonal(&variances.inf(&most)));
+    }
+
+    /// The map is turned about its origin, lines and pose as one: the error of the position is turned, by three shears; those of lines
+    /// are along their normals, and stay.
+    pub(crate) fn turn_pose(&mut self, angle_rad: f32) {
+        let (s, c) = sin_cos(angle_rad);
+        // −tan(a/2); a closed loop turns the map by a few degrees.
+        let shear = -s / max(1.0 + c, 1e-3);
+        for (state, other, factor) in [(POSE, POSE + 1, shear), (POSE + 1, POSE, s), (POSE, POSE + 1, shear)]
+        {
+            self.covariance.add_multiples(state, &[(other, factor)]);
+        }
+    }
+
+    /// Takes a line of the map out of the state, if it is there.
+    pub(crate) fn decouple_line<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) {
+        if let Some(slot) = self.slots.slot_of(index) {
+            self.decouple(slot, map);
+        }
     }
 
     /// Adds to the pose's covariance.

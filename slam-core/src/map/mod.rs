@@ -182,11 +182,6 @@ impl<const N: usize> SegmentMap<N> {
             self.counters.forgotten = self.counters.forgotten.saturating_add(1);
         }
     }
-
-    /// All segments, to be moved.
-    pub(crate) fn iter_mut(&mut self) -> impl Iterator<Item = &mut MapSegment> {
-        self.segments.iter_mut()
-    }
 }
 
 #[cfg(test)]

@@ -10,17 +10,17 @@ use crate::estimator::Estimator;
 use crate::frontend::Frontend;
 use crate::frontend::deskew::ScanPoint;
 use crate::geometry::segment::Segment;
-use crate::loop_closure::LoopCloser;
 use crate::map::SegmentMap;
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
 use crate::odometry::wheel_faults::WheelFault;
+use crate::places::Places;
 use crate::sensor::scan::SensorConfig;
 use crate::tracking::state::StateMonitor;
 use crate::tracking::{Tracker, TrackingState};
 use crate::update::Counters;
 
-impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
+impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Size in RAM.
     pub const BYTES: usize = core::mem::size_of::<Self>();
 
@@ -67,7 +67,7 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
             estimator: Estimator::blank(),
             frontend: Frontend::new(),
             tracker: Tracker::new(),
-            loops: LoopCloser::default(),
+            places: Places::new(),
             odometry: OdometryHealth::new(config.line_noise, config.odometry.noise),
             state: StateMonitor::default(),
             counters: Counters::default(),
@@ -87,6 +87,11 @@ impl<const N: usize, const BEAMS: usize> Slam<N, BEAMS> {
     /// The map.
     pub fn map(&self) -> &SegmentMap<N> {
         &self.map
+    }
+
+    /// Places along the way, and the loops between them.
+    pub fn places(&self) -> &Places<P> {
+        &self.places
     }
 
     /// Pose of `base` in `map` at the last scan.

@@ -190,26 +190,15 @@ impl<const N: usize> Tracker<N> {
         }
     }
 
-    /// Finds the candidates: the map segments that a scan from this pose can touch and that count. The paper looks at all of them.
-    pub fn gather(
-        &mut self,
-        map: &[MapSegment],
-        pose: &Isometry2<f32>,
-        config: &SlamConfig,
-        counts: impl Fn(&MapSegment) -> bool,
-    ) {
+    /// Finds the candidates: the map segments that a scan from this pose can touch. The paper looks at all of them.
+    #[inline(never)]
+    pub fn gather(&mut self, map: &[MapSegment], pose: &Isometry2<f32>, config: &SlamConfig) {
         let reach_m = match config.association {
             AssociationConfig::Bisector(_) => f32::INFINITY,
             AssociationConfig::Gated(_) => config.sensor.reach_m(),
         };
-        self.nearby.gather(map, pose, reach_m, counts);
+        self.nearby.gather(map, pose, reach_m, |_| true);
         self.shortlist.clear();
-    }
-
-    /// The same of all map segments.
-    #[inline(never)]
-    pub fn gather_all(&mut self, scene: &Scene<'_>, pose: &Isometry2<f32>) {
-        self.gather(scene.map, pose, scene.config, |_| true);
     }
 
     /// The map's segments have new indices.
@@ -251,7 +240,7 @@ impl<const N: usize> Tracker<N> {
     ) -> Tracked {
         watch(Stage::Association);
         self.iterations = 0;
-        self.gather_all(scene, &prior.pose);
+        self.gather(scene.map, &prior.pose, scene.config);
         let mut tracked = Tracked {
             hypothesis: Hypothesis::of_prior(prior),
             iterations: 0,
@@ -316,7 +305,7 @@ impl<const N: usize> Tracker<N> {
             }
             if let Some(winner) = self.search(scene, &broad, best, search, watch) {
                 (*best, by_scan) = (winner, true);
-                self.gather_all(scene, &best.pose);
+                self.gather(scene.map, &best.pose, scene.config);
             }
             watch(Stage::Association);
             self.associate(scene, best);
@@ -423,7 +412,7 @@ impl<const N: usize> Tracker<N> {
             }
         });
         if let Some(winner) = &winner {
-            self.gather_all(scene, &winner.pose);
+            self.gather(scene.map, &winner.pose, scene.config);
             self.associate(scene, winner);
         }
         winner

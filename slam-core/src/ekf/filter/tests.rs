@@ -64,3 +64,31 @@ fn variances_that_rounding_spoilt_are_survived() {
 fn size_is_what_the_documentation_says() {
     assert!(core::mem::size_of::<EkfSlam>() <= 22 * 1024, "{}", core::mem::size_of::<EkfSlam>());
 }
+
+/// Against G·P·Gᵀ, with G the rotation of x and y.
+#[test]
+fn a_turned_map_turns_the_position_s_error_and_nothing_else() {
+    for angle in [0.0, 0.3, -1.2, 3.0f32] {
+        let mut world = World::new(5);
+        world.look();
+        (0..40).for_each(|_| world.step(0.1, Vector3::zeros()));
+        let before = world.filter.clone();
+        world.filter.turn_pose(angle);
+        let (s, c) = angle.sin_cos();
+        let live = before.covariance.live();
+        let dense =
+            nalgebra::DMatrix::<f64>::from_fn(live, live, |i, j| f64::from(before.covariance.get(i, j)));
+        let mut turn = nalgebra::DMatrix::<f64>::identity(live, live);
+        let (s, c) = (f64::from(s), f64::from(c));
+        for (i, j, v) in [(0, 0, c), (0, 1, -s), (1, 0, s), (1, 1, c)] {
+            turn[(POSE + i, POSE + j)] = v;
+        }
+        let expected = &turn * dense * turn.transpose();
+        for i in 0..live {
+            for j in 0..=i {
+                let off = f64::from(world.filter.covariance.get(i, j)) - expected[(i, j)];
+                assert!(off.abs() < 1e-6 + 1e-3 * expected[(i, j)].abs(), "{angle}: {i} {j} {off}");
+            }
+        }
+    }
+}

@@ -1,0 +1,207 @@
+//! The lines of a place: a dozen, in its own frame, in millimetres.
+//!
+//! In: the lines of the local map that were seen around the place. Out: those that say most of where the robot is.
+
+use heapless::Vec;
+use nalgebra::{Isometry2, Point2, Vector2};
+
+use crate::geometry::math::{atan2, max, min, sqrt};
+use crate::geometry::pose::{cross, perpendicular};
+use crate::geometry::segment::Segment;
+use crate::map::MapSegment;
+
+/// Most lines of a place.
+pub const PLACE_LINES: usize = 12;
+/// Lines farther from the place than this are not its, metres.
+const REACH_M: f32 = 15.0;
+/// Shorter lines do not count, metres, nor what fewer keyframes saw.
+const LEAST_LENGTH_M: f32 = 0.4;
+const LEAST_HITS: u16 = 2;
+/// Longer lines, and lines seen more often, say no more.
+const MOST_LENGTH_M: f32 = 5.0;
+const MOST_HITS: u16 = 8;
+/// Lines within this angle of each other say the same of the heading, as a sine.
+const ALIKE_SINE: f32 = 0.35;
+
+/// A line of a place: both ends, millimetres in the place's frame; walking from the first to the second, the free side is on the left.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PlaceLine([i16; 4]);
+
+/// Lines of a place.
+pub type PlaceLines = Vec<PlaceLine, PLACE_LINES>;
+
+impl PlaceLine {
+    /// None where an end lies beyond 32 m.
+    fn of(start: Point2<f32>, end: Point2<f32>) -> Option<Self> {
+        let mut ends = [0; 4];
+        for (slot, metres) in ends.iter_mut().zip([start.x, start.y, end.x, end.y]) {
+            let mm = metres * 1000.0;
+            if mm.is_nan() || mm.abs() > f32::from(i16::MAX) {
+                return None;
+            }
+            *slot = (mm + if mm < 0.0 { -0.5 } else { 0.5 }) as i16;
+        }
+        Some(Self(ends))
+    }
+
+    /// Both ends, metres.
+    pub fn ends(&self) -> [Point2<f32>; 2] {
+        let [ax, ay, bx, by] = self.0.map(|mm| f32::from(mm) * 1e-3);
+        [Point2::new(ax, ay), Point2::new(bx, by)]
+    }
+}
+
+/// A line as matching wants it, in the frame of its place.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Ray {
+    pub start: Point2<f32>,
+    pub end: Point2<f32>,
+    pub middle: Point2<f32>,
+    pub direction: Vector2<f32>,
+    pub normal: Vector2<f32>,
+    /// Normal times any of its points.
+    pub offset_m: f32,
+    pub length_m: f32,
+    pub angle_rad: f32,
+}
+
+/// The lines of a place, unpacked; those without a length are left out.
+pub(super) fn unpacked(lines: &[PlaceLine]) -> Vec<Ray, PLACE_LINES> {
+    let ray = |line: &PlaceLine| {
+        let [start, end] = line.ends();
+        let along = end - start;
+        let length_m = sqrt(along.norm_squared());
+        if length_m <= 0.0 {
+            return None;
+        }
+        let direction = along / length_m;
+        let normal = perpendicular(direction);
+        Some(Ray {
+            start,
+            end,
+            middle: nalgebra::center(&start, &end),
+            direction,
+            normal,
+            offset_m: normal.dot(&start.coords),
+            length_m,
+            angle_rad: atan2(direction.y, direction.x),
+        })
+    };
+    lines.iter().filter_map(ray).take(PLACE_LINES).collect()
+}
+
+/// Chooses the lines of a place at `anchor` from those of the map that `counts` holds for: one after the other the one with most length
+/// and hits, where a line loses by each that runs like it and is there already.
+///
+/// Work: [`PLACE_LINES`] passes over the map.
+pub(super) fn chosen(
+    map: &[MapSegment],
+    anchor: &Isometry2<f32>,
+    counts: impl Fn(&MapSegment) -> bool,
+) -> PlaceLines {
+    let place_from_map = anchor.inverse();
+    let mut taken: Vec<u16, PLACE_LINES> = Vec::new();
+    let mut lines = PlaceLines::new();
+    while !taken.is_full() {
+        let alike = |segment: &Segment| {
+            let same = taken
+                .iter()
+                .filter_map(|index| map.get(usize::from(*index)))
+                .filter(|other| cross(other.segment.direction, segment.direction).abs() < ALIKE_SINE);
+            same.count() as f32
+        };
+        let mut best: Option<(usize, f32)> = None;
+        for (index, entry) in map.iter().enumerate() {
+            let segment = &entry.segment;
+            if taken.contains(&(index as u16)) || !is_of(entry, anchor) || !counts(entry) {
+                continue;
+            }
+            let worth = min(segment.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS))
+                / (1.0 + alike(segment));
+            if worth > best.map_or(0.0, |(_, most)| most) {
+                best = Some((index, worth));
+            }
+        }
+        let Some((index, _)) = best else { break };
+        let _ = taken.push(index as u16);
+        let ends = map.get(index).and_then(|e| clipped(&e.segment.transformed(&place_from_map)));
+        if let Some(line) = ends.and_then(|[start, end]| PlaceLine::of(start, end)) {
+            let _ = lines.push(line);
+        }
+    }
+    lines
+}
+
+/// Whether a line may be one of a place.
+fn is_of(entry: &MapSegment, anchor: &Isometry2<f32>) -> bool {
+    let segment = &entry.segment;
+    let along = within_line(segment, anchor.translation.vector.into());
+    let nearest = segment.moments.centroid + segment.direction * along;
+    entry.hits >= LEAST_HITS
+        && segment.length_m() >= LEAST_LENGTH_M
+        && (nearest.coords - anchor.translation.vector).norm_squared() < REACH_M * REACH_M
+}
+
+fn within_line(segment: &Segment, point: Point2<f32>) -> f32 {
+    let (from, to) = (segment.along_of(segment.start), segment.along_of(segment.end));
+    max(min(segment.along_of(point), to), from)
+}
+
+/// The ends of a line in a place's frame, none farther along it from the place's foot than [`REACH_M`].
+fn clipped(segment: &Segment) -> Option<[Point2<f32>; 2]> {
+    let foot = segment.along_of(Point2::origin());
+    let from = max(segment.along_of(segment.start), foot - REACH_M);
+    let to = min(segment.along_of(segment.end), foot + REACH_M);
+    let at = |along: f32| segment.moments.centroid + segment.direction * along;
+    (to - from >= LEAST_LENGTH_M).then(|| [at(from), at(to)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::pose::pose;
+
+    fn entry(from: (f32, f32), to: (f32, f32), hits: u16) -> MapSegment {
+        let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
+        let segment =
+            Segment::from_ends(from, to, 9, 1e-4, nalgebra::center(&from, &to) + perpendicular(to - from));
+        MapSegment { segment, hits, seen_through: 0, last_seen: 1, seen_at_m: 0.0 }
+    }
+
+    #[test]
+    fn directions_are_spread_and_short_or_doubtful_lines_stay_out() {
+        let mut map: std::vec::Vec<_> =
+            (0..20).map(|k| entry((0.0, 0.2 * k as f32), (4.0, 0.2 * k as f32), 9)).collect();
+        map.push(entry((1.0, 0.0), (1.0, 1.0), 9));
+        map.push(entry((2.0, 0.0), (2.0, 0.3), 9));
+        map.push(entry((3.0, 0.0), (3.0, 2.0), 1));
+        map.push(entry((40.0, 0.0), (40.0, 2.0), 9));
+        let lines = chosen(&map, &pose(1.0, 0.5, 0.3), |_| true);
+        assert_eq!(lines.len(), PLACE_LINES);
+        let across = unpacked(&lines)
+            .iter()
+            .filter(|r| (r.angle_rad - (core::f32::consts::FRAC_PI_2 - 0.3)).abs() < 0.01)
+            .count();
+        assert_eq!(across, 1);
+        assert!(chosen(&map, &pose(1.0, 0.5, 0.3), |_| false).is_empty());
+    }
+
+    #[test]
+    fn a_line_comes_back_to_a_millimetre() {
+        let anchor = pose(100.0, -50.0, 2.0);
+        let map = [entry((101.0, -49.0), (99.0, -46.5), 5)];
+        let lines = chosen(&map, &anchor, |_| true);
+        let [start, end] = lines[0].ends();
+        assert!((anchor * start - map[0].segment.start).norm() < 1e-3);
+        assert!((anchor * end - map[0].segment.end).norm() < 1e-3);
+    }
+
+    #[test]
+    fn a_long_wall_is_cut_and_one_beyond_the_numbers_left_out() {
+        let map = [entry((-80.0, 1.0), (90.0, 1.0), 5)];
+        let lines = chosen(&map, &pose(0.0, 0.0, 0.0), |_| true);
+        assert!((unpacked(&lines)[0].length_m - 2.0 * REACH_M).abs() < 1e-2);
+        assert_eq!(PlaceLine::of(Point2::new(33.0, 0.0), Point2::origin()), None);
+        assert_eq!(PlaceLine::of(Point2::new(f32::NAN, 0.0), Point2::origin()), None);
+    }
+}

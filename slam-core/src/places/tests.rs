@@ -1,0 +1,144 @@
+//! Robots that drive, see what is around them, and drift.
+
+use super::*;
+use crate::geometry::pose::{exp, normalized, perpendicular};
+use crate::geometry::segment::Segment;
+use nalgebra::Vector3;
+
+const CONFIG: PlacesConfig = crate::config::PLACES;
+
+fn wall(from: (f32, f32), to: (f32, f32)) -> Segment {
+    let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
+    Segment::from_ends(from, to, 9, 1e-4, nalgebra::center(&from, &to) + perpendicular(to - from))
+}
+
+/// Things of many sizes and directions along both sides of a way round a block of `w` by `h` metres.
+fn building(w: f32, h: f32) -> std::vec::Vec<Segment> {
+    let mut seed = 3u32;
+    let mut random = || {
+        seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (seed >> 8) as f32 / (1 << 24) as f32
+    };
+    let mut walls = std::vec::Vec::new();
+    let round = 2.0 * (w + h);
+    for k in 0..(round / 1.5) as usize {
+        let at = along(1.5 * k as f32, w, h);
+        let side = if k % 2 == 0 { 1.5 + random() } else { -1.5 - random() };
+        let from = at * Point2::new(random(), side);
+        let (s, c) = (core::f32::consts::TAU * random()).sin_cos();
+        let length = 0.5 + 1.5 * random();
+        walls.push(wall((from.x, from.y), (from.x + c * length, from.y + s * length)));
+    }
+    walls
+}
+
+/// Where a robot is after a way round the block.
+fn along(way: f32, w: f32, h: f32) -> Isometry2<f32> {
+    let way = way % (2.0 * (w + h));
+    let quarter = core::f32::consts::FRAC_PI_2;
+    match way {
+        d if d < w => pose(d, 0.0, 0.0),
+        d if d < w + h => pose(w, d - w, quarter),
+        d if d < 2.0 * w + h => pose(2.0 * w + h - d, h, 2.0 * quarter),
+        d => pose(0.0, 2.0 * (w + h) - d, -quarter),
+    }
+}
+
+struct Drive {
+    places: std::boxed::Box<Places<96>>,
+    truth: Isometry2<f32>,
+    estimate: Isometry2<f32>,
+    way_m: f32,
+    closures: usize,
+    /// What was believed at each scan, moved with its places.
+    path: std::vec::Vec<(f32, Isometry2<f32>, Isometry2<f32>)>,
+}
+
+impl Drive {
+    fn new() -> Self {
+        let places = std::boxed::Box::new(Places::new());
+        let (truth, estimate) = (Isometry2::identity(), Isometry2::identity());
+        Self { places, truth, estimate, way_m: 0.0, closures: 0, path: std::vec::Vec::new() }
+    }
+
+    /// To a true pose, with so much drift.
+    fn go(&mut self, to: Isometry2<f32>, drift: Vector3<f32>, building: &[Segment]) {
+        let motion = self.truth.inv_mul(&to);
+        self.estimate = normalized(&(self.estimate * motion * exp(&drift)));
+        self.truth = to;
+        let motion = Increment::from_motion(motion);
+        self.way_m += motion.distance_m;
+        // The local map: what is around, as the robot believes it to lie.
+        let map_from_truth = self.estimate * to.inverse();
+        let near = |s: &&Segment| (s.midpoint().coords - to.translation.vector).norm() < 6.0;
+        let entry = |s: &Segment| MapSegment {
+            segment: s.transformed(&map_from_truth),
+            hits: 9,
+            seen_through: 0,
+            last_seen: 1,
+            seen_at_m: self.way_m,
+        };
+        let map: std::vec::Vec<_> = building.iter().filter(near).map(entry).collect();
+        let (pose, way_m) = (self.estimate, self.way_m);
+        self.path.push((way_m, pose, to));
+        let visit = Visit { pose, motion, way_m, verdict: Verdict::Full, support: 0.9, map: &map };
+        self.places.visit(&visit, &CONFIG);
+        if let Some(closure) = self.places.step(&CONFIG) {
+            self.closures += 1;
+            self.estimate = closure.moved * self.estimate;
+            for (way_m, pose, _) in &mut self.path {
+                *pose = self.places.moved_pose(*way_m, pose);
+            }
+        }
+    }
+
+    fn worst_m(&self) -> f32 {
+        let off = |(_, a, b): &(f32, Isometry2<f32>, Isometry2<f32>)| {
+            (a.translation.vector - b.translation.vector).norm()
+        };
+        self.path.iter().map(off).fold(0.0, f32::max)
+    }
+}
+
+#[test]
+fn a_robot_that_drifts_comes_home() {
+    let building = building(40.0, 20.0);
+    let mut drive = Drive::new();
+    let drift = Vector3::new(0.0004, 0.0, 0.00006);
+    (0..1000).for_each(|k| drive.go(along(0.15 * k as f32, 40.0, 20.0), drift, &building));
+    assert!(drive.closures > 0 && drive.places.loops().len() >= 2, "{} loops", drive.places.loops().len());
+    let home = (drive.estimate.translation.vector - drive.truth.translation.vector).norm();
+    // The first places had drifted by a decimetre before anything could be recognised.
+    assert!(home < 0.2, "{home}");
+    assert!(drive.worst_m() < 0.3, "{}", drive.worst_m());
+    let moved = drive.path.last().unwrap().1.translation.vector - drive.estimate.translation.vector;
+    assert!(moved.norm() < 0.05, "what is local moves with the robot: {moved}");
+}
+
+#[test]
+fn a_robot_that_goes_straight_on_closes_nothing() {
+    let building = building(150.0, 30.0);
+    let mut drive = Drive::new();
+    let drift = Vector3::new(0.0004, 0.0, 0.00006);
+    (0..900).for_each(|k| drive.go(along(0.15 * k as f32, 150.0, 30.0), drift, &building));
+    assert_eq!((drive.closures, drive.places.loops().len()), (0, 0));
+}
+
+#[test]
+fn more_way_than_there_is_room_for_thins_the_chain() {
+    let building = building(40.0, 20.0);
+    let mut drive = Drive::new();
+    let drift = Vector3::new(0.0003, 0.0, 0.00005);
+    (0..5500).for_each(|k| drive.go(along(0.15 * k as f32, 40.0, 20.0), drift, &building));
+    assert!(drive.places.anchors().len() >= 90 && drive.places.loops().len() == LOOPS);
+    assert!(drive.worst_m() < 0.4, "{}", drive.worst_m());
+    let ways = drive.places.anchors().windows(2).map(|two| two[1].way_m() - two[0].way_m());
+    assert!(ways.fold(0.0, f32::max) < 40.0, "no hole in the chain");
+    assert!(drive.places.is_whole());
+}
+
+#[test]
+fn size_is_what_the_documentation_says() {
+    let bytes = Places::<96>::BYTES;
+    assert!(bytes <= 172 * 96 + 17 * 1024, "{bytes}");
+}

@@ -1,0 +1,36 @@
+//! Going on with a map after a reset, or after a motion that nobody saw.
+
+use nalgebra::{Isometry2, Matrix3};
+
+use super::Slam;
+use crate::map::MapSegment;
+
+impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
+    /// Takes up a map made before, with the robot at a pose in it that is taken as certain. Segments beyond the capacity are left out, and
+    /// counted as refused.
+    pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {
+        self.map.take_up(map);
+        self.estimator.begin_at(map_from_base, &self.config);
+        self.places.clear();
+    }
+
+    /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.
+    pub fn loosen(&mut self, by: &Matrix3<f32>) {
+        let (estimator, mut around) = self.estimator();
+        estimator.inflate(by, &mut around);
+    }
+
+    /// Puts in order what a reset in the middle of [`Self::process_scan`] may have left half done. Segments that are not finite leave
+    /// the map, and the filter begins anew with what the map says. False where the pose is lost: nothing can be
+    /// kept then.
+    pub fn recover(&mut self) -> bool {
+        if !self.estimator.recover_pose() {
+            return false;
+        }
+        self.map.forget_broken();
+        self.estimator.begin_anew(&self.config);
+        // What was half written of them is not known.
+        self.places.clear();
+        true
+    }
+}
