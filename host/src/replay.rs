@@ -83,8 +83,10 @@ pub struct Step {
 pub struct Replay {
     /// Scan by scan.
     pub steps: Vec<Step>,
-    /// The map at the end.
+    /// The map at the end: its walls.
     pub map: Vec<MapSegment>,
+    /// The same with all that is tentative, as the front end has it.
+    pub local_map: Vec<MapSegment>,
     /// The map's counters.
     pub map_counters: MapCounters,
     /// The core's counters.
@@ -193,7 +195,8 @@ fn run_sized<const BEAMS: usize>(
     let slam = mapper.slam();
     Ok(Replay {
         steps,
-        map: slam.map().segments().to_vec(),
+        map: slam.walls().copied().collect(),
+        local_map: slam.map().segments().to_vec(),
         map_counters: slam.map().counters(),
         counters: slam.counters(),
         slam_bytes: Slam::<MAP_SEGMENTS, BEAMS>::BYTES,

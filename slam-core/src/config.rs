@@ -11,6 +11,7 @@ use crate::geometry::line_noise::LineNoise;
 use crate::geometry::math::min;
 use crate::map::openings::OpeningConfig;
 use crate::map::visibility::ForgetConfig;
+use crate::map::walls::WallConfig;
 use crate::odometry::bias::BiasConfig;
 use crate::odometry::delay::DelayConfig;
 use crate::odometry::monitor::MonitorConfig;
@@ -80,6 +81,8 @@ pub struct SlamConfig {
     pub forgetting: Option<ForgetConfig>,
     /// Cutting of what was seen through or driven through in part; together with forgetting only.
     pub openings: Option<OpeningConfig>,
+    /// Walls told from what is tentative, or every line taken for a wall.
+    pub walls: Option<WallConfig>,
     /// Segments to map.
     pub registration: RegistrationConfig,
 }
@@ -241,6 +244,14 @@ impl Default for SlamConfig {
             state: STATE,
             places: Some(PLACES),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
+            walls: Some(WallConfig {
+                min_hits: 3,
+                max_gap_m: 0.15,
+                angles_rad: [0.05, 0.9],
+                max_bridge_m: 2.5,
+                forget_m: 10.0,
+                lines_per_keyframe: 4,
+            }),
             openings: Some(OpeningConfig {
                 min_width_m: 0.4,
                 passage_m: 0.5,
@@ -312,6 +323,7 @@ impl SlamConfig {
             places: None,
             forgetting: None,
             openings: None,
+            walls: None,
             registration: RegistrationConfig::EndPoints(EndPointsConfig { weight: EndPointWeight::Equal }),
         }
     }
@@ -483,6 +495,9 @@ impl SlamConfig {
             not_negative("forgetting.margin_sigmas", c.margin_sigmas)?;
             check("forgetting.min_sine", (0.0..=1.0).contains(&c.min_sine))?;
             check("forgetting.scans", c.scans > 0)?;
+        }
+        if let Some(c) = &self.walls {
+            c.validate()?;
         }
         if let Some(c) = &self.openings {
             positive("openings.min_width_m", c.min_width_m)?;

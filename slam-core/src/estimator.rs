@@ -24,6 +24,7 @@ use crate::geometry::segment::Segment;
 use crate::map::SegmentMap;
 use crate::map::openings::{OpeningConfig, opening};
 use crate::map::visibility::View;
+use crate::map::walls::WallConfig;
 use crate::odometry::Increment;
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
@@ -67,6 +68,8 @@ pub(crate) struct Estimator {
     opened_from: Point2<f32>,
     /// Whose turn is next to be looked at for openings: a rank among the lines nearby, modulo their number.
     next_opened: u16,
+    /// The line that is next to be looked at for being spent.
+    next_spent: u16,
     /// Scans before the one at hand.
     scans: u32,
     travelled_m: f32,
@@ -94,6 +97,7 @@ impl Estimator {
             anchor: Anchor::default(),
             opened_from: Point2::origin(),
             next_opened: 0,
+            next_spent: 0,
             scans: 0,
             travelled_m: 0.0,
         }
@@ -370,6 +374,24 @@ impl Estimator {
         match &mut self.filter {
             Some(filter) => LineMap { map, filter }.remove(index),
             None => map.forget(index),
+        }
+    }
+
+    /// Forgets what is tentative and was not seen for long, of the next few lines.
+    ///
+    /// Work: that of [`WallConfig::is_wall`] for [`WallConfig::lines_per_keyframe`] lines.
+    pub fn forget_spent<const N: usize>(&mut self, config: &WallConfig, map: &mut SegmentMap<N>) {
+        for _ in 0..config.lines_per_keyframe {
+            let index = match usize::from(self.next_spent) {
+                index if index < map.segments().len() => index,
+                _ => 0,
+            };
+            if config.is_spent(index, map.segments(), self.travelled_m) {
+                // The last line takes its place, and is next.
+                self.forget_line(index, map);
+            } else {
+                self.next_spent = index as u16 + 1;
+            }
         }
     }
 

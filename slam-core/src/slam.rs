@@ -23,7 +23,7 @@ pub use crate::update::{Counters, ScanRejection, SlamUpdate, Stage};
 
 /// Map, pose and working memory: room for `N` map segments, `BEAMS` beams and `P` places.
 ///
-/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 16 for each beam, 172 for each place and 47 KiB.
+/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 16 for each beam, 172 for each place and 40 KiB.
 pub struct Slam<const N: usize, const BEAMS: usize = 682, const P: usize = 96> {
     config: SlamConfig,
     map: SegmentMap<N>,
@@ -198,6 +198,9 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {
             estimator.forget_line(index, map);
         }
+        if let Some(walls) = &self.config.walls {
+            estimator.forget_spent(walls, map);
+        }
     }
 
     /// Takes the scan into the places, and does some of their work. Where loops have corrected them, everything moves with them.
@@ -210,6 +213,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             verdict: update.observability.verdict,
             support: update.support,
             map: self.map.segments(),
+            walls: self.config.walls.as_ref(),
         };
         self.places.visit(&visit, &config);
         for _ in 0..Places::<P>::steps(motion) {

@@ -46,7 +46,7 @@ impl FixedSet {
             let apart = steps.iter().map(|s| (middle - s.pose_in_final_map.translation.vector).norm());
             apart.fold(f32::MAX, f32::min)
         };
-        let mut own = replayed.map;
+        let mut own = replayed.local_map;
         own.sort_by(|a, b| from_way(a).total_cmp(&from_way(b)));
         Ok(Self {
             ranges_mm: logged.iter().map(|scan| scan.ranges_mm.clone()).collect(),

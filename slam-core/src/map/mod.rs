@@ -6,6 +6,7 @@
 pub mod nearby;
 pub mod openings;
 pub mod visibility;
+pub mod walls;
 
 use heapless::Vec;
 

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Vector3};
 use crate::geometry::math::sqrt;
 
 /// Most loops that are kept.
-pub const LOOPS: usize = 24;
+pub const LOOPS: usize = 16;
 /// Rows.
 pub(super) const ROWS: usize = 3 * LOOPS;
 const LEN: usize = ROWS * (ROWS + 1) / 2;
@@ -13,7 +13,7 @@ const LEN: usize = ROWS * (ROWS + 1) / 2;
 /// Numbers for each row.
 pub(super) type Column = [f32; ROWS];
 
-/// L, row by row: element (i, j ≤ i) at i·(i + 1)/2 + j. 10.3 KiB.
+/// L, row by row: element (i, j ≤ i) at i·(i + 1)/2 + j. 4.6 KiB.
 #[derive(Clone, Debug)]
 pub(super) struct Factor {
     values: [f32; LEN],

@@ -90,19 +90,25 @@ pub(super) fn unpacked(lines: &[PlaceLine]) -> Vec<Ray, PLACE_LINES> {
     lines.iter().filter_map(ray).take(PLACE_LINES).collect()
 }
 
+/// Most lines that are asked whether they are walls.
+const ASKED: usize = 3 * PLACE_LINES;
+
 /// Chooses the lines of a place at `anchor` from those of the map that `counts` holds for: one after the other the one with most length
-/// and hits, where a line loses by each that runs like it and is there already.
+/// and hits, where a line loses by each that runs like it and is there already. One that `is_wall` does not hold for, by its index, is
+/// passed over.
 ///
-/// Work: [`PLACE_LINES`] passes over the map.
+/// Work: [`ASKED`] passes over the map, and as many questions, at most.
 pub(super) fn chosen(
     map: &[MapSegment],
     anchor: &Isometry2<f32>,
     counts: impl Fn(&MapSegment) -> bool,
+    is_wall: impl Fn(usize) -> bool,
 ) -> PlaceLines {
     let place_from_map = anchor.inverse();
+    let mut asked: Vec<u16, ASKED> = Vec::new();
     let mut taken: Vec<u16, PLACE_LINES> = Vec::new();
     let mut lines = PlaceLines::new();
-    while !taken.is_full() {
+    while !taken.is_full() && !asked.is_full() {
         let alike = |segment: &Segment| {
             let same = taken
                 .iter()
@@ -113,7 +119,7 @@ pub(super) fn chosen(
         let mut best: Option<(usize, f32)> = None;
         for (index, entry) in map.iter().enumerate() {
             let segment = &entry.segment;
-            if taken.contains(&(index as u16)) || !is_of(entry, anchor) || !counts(entry) {
+            if asked.contains(&(index as u16)) || !is_of(entry, anchor) || !counts(entry) {
                 continue;
             }
             let worth = min(segment.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS))
@@ -123,6 +129,10 @@ pub(super) fn chosen(
             }
         }
         let Some((index, _)) = best else { break };
+        let _ = asked.push(index as u16);
+        if !is_wall(index) {
+            continue;
+        }
         let _ = taken.push(index as u16);
         let ends = map.get(index).and_then(|e| clipped(&e.segment.transformed(&place_from_map)));
         if let Some(line) = ends.and_then(|[start, end]| PlaceLine::of(start, end)) {
@@ -176,21 +186,21 @@ mod tests {
         map.push(entry((2.0, 0.0), (2.0, 0.3), 9));
         map.push(entry((3.0, 0.0), (3.0, 2.0), 1));
         map.push(entry((40.0, 0.0), (40.0, 2.0), 9));
-        let lines = chosen(&map, &pose(1.0, 0.5, 0.3), |_| true);
+        let lines = chosen(&map, &pose(1.0, 0.5, 0.3), |_| true, |_| true);
         assert_eq!(lines.len(), PLACE_LINES);
         let across = unpacked(&lines)
             .iter()
             .filter(|r| (r.angle_rad - (core::f32::consts::FRAC_PI_2 - 0.3)).abs() < 0.01)
             .count();
         assert_eq!(across, 1);
-        assert!(chosen(&map, &pose(1.0, 0.5, 0.3), |_| false).is_empty());
+        assert!(chosen(&map, &pose(1.0, 0.5, 0.3), |_| false, |_| true).is_empty());
     }
 
     #[test]
     fn a_line_comes_back_to_a_millimetre() {
         let anchor = pose(100.0, -50.0, 2.0);
         let map = [entry((101.0, -49.0), (99.0, -46.5), 5)];
-        let lines = chosen(&map, &anchor, |_| true);
+        let lines = chosen(&map, &anchor, |_| true, |_| true);
         let [start, end] = lines[0].ends();
         assert!((anchor * start - map[0].segment.start).norm() < 1e-3);
         assert!((anchor * end - map[0].segment.end).norm() < 1e-3);
@@ -199,7 +209,7 @@ mod tests {
     #[test]
     fn a_long_wall_is_cut_and_one_beyond_the_numbers_left_out() {
         let map = [entry((-80.0, 1.0), (90.0, 1.0), 5)];
-        let lines = chosen(&map, &pose(0.0, 0.0, 0.0), |_| true);
+        let lines = chosen(&map, &pose(0.0, 0.0, 0.0), |_| true, |_| true);
         assert!((unpacked(&lines)[0].length_m - 2.0 * REACH_M).abs() < 1e-2);
         assert_eq!(PlaceLine::of(Point2::new(33.0, 0.0), Point2::origin()), None);
         assert_eq!(PlaceLine::of(Point2::new(f32::NAN, 0.0), Point2::origin()), None);

@@ -297,7 +297,8 @@ mod tests {
         let map = room();
         let there = pose(3.0, 2.0, 0.3);
         for here in [pose(2.0, 2.5, 0.3), pose(4.0, 1.0, -2.5), pose(1.5, 3.0, 1.2)] {
-            let (query, place) = (chosen(&map, &here, |_| true), chosen(&map, &there, |_| true));
+            let (query, place) =
+                (chosen(&map, &here, |_| true, |_| true), chosen(&map, &there, |_| true, |_| true));
             let truth = there.inv_mul(&here);
             let drifted = pose(1.5, -1.0, 0.2) * truth;
             let found =
@@ -313,7 +314,7 @@ mod tests {
     fn nothing_beyond_the_gate_is_found() {
         let map = room();
         let at = pose(3.0, 2.0, 0.3);
-        let lines = unpacked(&chosen(&map, &at, |_| true));
+        let lines = unpacked(&chosen(&map, &at, |_| true, |_| true));
         assert!(matched(&lines, &lines, &gate(pose(9.0, 0.0, 0.0), [0.3, 0.3, 0.05])).is_none());
         assert!(matched(&lines, &[], &gate(pose(0.0, 0.0, 0.0), [0.3, 0.3, 0.05])).is_none());
         assert!(matched(&[], &lines, &gate(pose(0.0, 0.0, 0.0), [0.3, 0.3, 0.05])).is_none());
@@ -328,8 +329,8 @@ mod tests {
             map.push(wall((x + 1.2, 0.0), (x + 1.2, -0.6)));
         }
         let (query, place) = (
-            unpacked(&chosen(&map, &pose(8.0, 1.0, 0.0), |_| true)),
-            unpacked(&chosen(&map, &pose(8.0, 1.0, 0.0), |_| true)),
+            unpacked(&chosen(&map, &pose(8.0, 1.0, 0.0), |_| true, |_| true)),
+            unpacked(&chosen(&map, &pose(8.0, 1.0, 0.0), |_| true, |_| true)),
         );
         let found = matched(&query, &place, &gate(pose(0.0, 0.0, 0.0), [2.0, 2.0, 0.1])).unwrap();
         assert!(found.runner_up > 0.8 * found.share, "{found:?}");

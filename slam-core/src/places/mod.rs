@@ -28,6 +28,7 @@ use crate::geometry::math::within;
 use crate::geometry::pose::components;
 use crate::geometry::pose::{heading, normalized, pose, turn};
 use crate::map::MapSegment;
+use crate::map::walls::WallConfig;
 use crate::odometry::Increment;
 use crate::tracking::correction::Verdict;
 use chain::Support;
@@ -110,8 +111,10 @@ pub(crate) struct Visit<'a> {
     pub verdict: Verdict,
     /// Share of it that the map explains.
     pub support: f32,
-    /// The local map.
+    /// The local map, …
     pub map: &'a [MapSegment],
+    /// … and which of its lines are walls.
+    pub walls: Option<&'a WallConfig>,
 }
 
 /// Loops were closed, and the places have moved.
@@ -126,7 +129,7 @@ const STEP_M: f32 = 0.1;
 /// … but not more than this.
 const MOST_STEPS: u8 = 12;
 
-/// Up to `P` places. RAM: 172·`P` bytes and 17 KiB.
+/// Up to `P` places. RAM: 172·`P` bytes and 10 KiB.
 #[derive(Clone, Debug)]
 pub struct Places<const P: usize> {
     chain: Chain<P>,
@@ -188,10 +191,11 @@ impl<const P: usize> Places<P> {
         if !is_due {
             return;
         }
+        let is_wall = |index: usize| visit.walls.is_none_or(|walls| walls.is_wall(index, visit.map));
         let seen_within =
             |way_m: f32| move |entry: &MapSegment| (entry.seen_at_m - way_m).abs() <= config.seen_within_m;
         if let Some(last) = self.chain.anchors.last_mut() {
-            last.lines = lines::chosen(visit.map, &last.pose, seen_within(last.way_m));
+            last.lines = lines::chosen(visit.map, &last.pose, seen_within(last.way_m), is_wall);
         }
         if self.chain.anchors.is_full() {
             self.make_room();
@@ -201,7 +205,7 @@ impl<const P: usize> Places<P> {
         }
         self.support = Support::NONE;
         if let Some(own) = self.chain.anchors.last_mut() {
-            own.lines = lines::chosen(visit.map, &own.pose, seen_within(own.way_m));
+            own.lines = lines::chosen(visit.map, &own.pose, seen_within(own.way_m), is_wall);
         }
         self.finder.begin(self.chain.anchors.len() as u16 - 1, &self.chain);
     }

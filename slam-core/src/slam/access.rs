@@ -10,7 +10,7 @@ use crate::estimator::Estimator;
 use crate::frontend::Frontend;
 use crate::frontend::deskew::ScanPoint;
 use crate::geometry::segment::Segment;
-use crate::map::SegmentMap;
+use crate::map::{MapSegment, SegmentMap};
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
 use crate::odometry::wheel_faults::WheelFault;
@@ -82,6 +82,14 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// The settings.
     pub fn config(&self) -> &SlamConfig {
         &self.config
+    }
+
+    /// The lines of the map that stand: walls, without what is tentative. Work: for each, that of
+    /// [`WallConfig::is_wall`](crate::map::walls::WallConfig::is_wall).
+    pub fn walls(&self) -> impl Iterator<Item = &MapSegment> {
+        let (walls, map) = (self.config.walls, self.map.segments());
+        let stands = move |index: usize| walls.is_none_or(|walls| walls.is_wall(index, map));
+        map.iter().enumerate().filter(move |(index, _)| stands(*index)).map(|(_, entry)| entry)
     }
 
     /// The map.
