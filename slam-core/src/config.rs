@@ -247,9 +247,11 @@ impl Default for SlamConfig {
             walls: Some(WallConfig {
                 min_hits: 3,
                 max_gap_m: 0.15,
-                angles_rad: [0.05, 0.9],
+                sines: [0.05, 0.8],
                 max_bridge_m: 2.5,
                 forget_m: 10.0,
+                revisit_m: 15.0,
+                max_twin_gap_m: 0.1,
                 lines_per_keyframe: 4,
             }),
             openings: Some(OpeningConfig {

@@ -24,7 +24,7 @@ use crate::geometry::segment::Segment;
 use crate::map::SegmentMap;
 use crate::map::openings::{OpeningConfig, opening};
 use crate::map::visibility::View;
-use crate::map::walls::WallConfig;
+use crate::map::walls::{Fate, WallConfig};
 use crate::odometry::Increment;
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
@@ -68,8 +68,8 @@ pub(crate) struct Estimator {
     opened_from: Point2<f32>,
     /// Whose turn is next to be looked at for openings: a rank among the lines nearby, modulo their number.
     next_opened: u16,
-    /// The line that is next to be looked at for being spent.
-    next_spent: u16,
+    /// The line that is next to be tidied up.
+    next_tidied: u16,
     /// Scans before the one at hand.
     scans: u32,
     travelled_m: f32,
@@ -97,7 +97,7 @@ impl Estimator {
             anchor: Anchor::default(),
             opened_from: Point2::origin(),
             next_opened: 0,
-            next_spent: 0,
+            next_tidied: 0,
             scans: 0,
             travelled_m: 0.0,
         }
@@ -377,20 +377,21 @@ impl Estimator {
         }
     }
 
-    /// Forgets what is tentative and was not seen for long, of the next few lines.
+    /// Of the next few lines out of sight forgets what is tentative, and makes one of what is the same wall.
     ///
-    /// Work: that of [`WallConfig::is_wall`] for [`WallConfig::lines_per_keyframe`] lines.
-    pub fn forget_spent<const N: usize>(&mut self, config: &WallConfig, map: &mut SegmentMap<N>) {
+    /// Work: that of [`WallConfig::fate`] for [`WallConfig::lines_per_keyframe`] lines.
+    pub fn tidy<const N: usize>(&mut self, config: &WallConfig, map: &mut SegmentMap<N>) {
         for _ in 0..config.lines_per_keyframe {
-            let index = match usize::from(self.next_spent) {
-                index if index < map.segments().len() => index,
-                _ => 0,
-            };
-            if config.is_spent(index, map.segments(), self.travelled_m) {
-                // The last line takes its place, and is next.
-                self.forget_line(index, map);
-            } else {
-                self.next_spent = index as u16 + 1;
+            let index = usize::from(self.next_tidied).min(map.segments().len());
+            self.next_tidied = if index < map.segments().len() { index as u16 + 1 } else { 0 };
+            let hits = |index: usize| map.segments().get(index).map_or(0, |entry| entry.hits);
+            match (config.fate(index, map.segments(), self.travelled_m), &mut self.filter) {
+                (Fate::Forgotten, _) => self.forget_line(index, map),
+                (Fate::IsOneWith(twin), Some(filter)) => {
+                    let (kept, gone) = if hits(twin) > hits(index) { (twin, index) } else { (index, twin) };
+                    LineMap { map, filter }.merge(kept, gone);
+                }
+                _ => {}
             }
         }
     }

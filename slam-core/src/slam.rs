@@ -199,7 +199,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             estimator.forget_line(index, map);
         }
         if let Some(walls) = &self.config.walls {
-            estimator.forget_spent(walls, map);
+            estimator.tidy(walls, map);
         }
     }
 
@@ -216,9 +216,9 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             walls: self.config.walls.as_ref(),
         };
         self.places.visit(&visit, &config);
-        for _ in 0..Places::<P>::steps(motion) {
+        for _ in 0..Places::<P>::steps(motion, update.registration.keyframe) {
             // One at most for each scan: who asks how the places have moved must not miss any.
-            update.closure = self.places.step(&config);
+            update.closure = self.places.step(&visit, &config);
             if let Some(closure) = update.closure {
                 let Self { config, odometry, frontend, map, tracker, estimator, places, .. } = self;
                 let mut around =

@@ -11,10 +11,10 @@ use crate::firmware::{self, Build};
 use crate::run::{announce, cargo, step, target_folder};
 
 /// Flash that the firmware may take: code, constants, and what variables begin with.
-const FLASH_BUDGET: u64 = 208 * 1024;
+const FLASH_BUDGET: u64 = 212 * 1024;
 /// RAM that it may take, the map for 512 segments and 96 places among it, less the stack, which is measured as it runs: a test of the
-/// emulated board holds both together to 132 KiB of 192.
-const RAM_BUDGET: u64 = (132 - 10) * 1024;
+/// emulated board holds both together to 124 KiB of 192.
+const RAM_BUDGET: u64 = (124 - 10) * 1024;
 
 /// What a report prints of an ELF file.
 struct Sizes {

@@ -24,14 +24,32 @@ pub struct WallConfig {
     pub min_hits: u16,
     /// A bridge's end is not farther from the line on which it lies than this, metres, …
     pub max_gap_m: f32,
-    /// … and the angle between them is one of this range, radians.
-    pub angles_rad: [f32; 2],
+    /// … and the sine of the angle between them is one of this range.
+    pub sines: [f32; 2],
     /// A longer line is no bridge, metres.
     pub max_bridge_m: f32,
     /// What is tentative is forgotten when it was not seen on so long a way, metres.
     pub forget_m: f32,
-    /// Lines that are looked at for that in each keyframe; they take turns.
+    /// Walls out of sight that were seen last on visits so far apart, by the way between them, metres, are one …
+    pub revisit_m: f32,
+    /// … where they lie side by side, not farther from each other than this, metres.
+    pub max_twin_gap_m: f32,
+    /// Lines that are looked at for both in each keyframe; they take turns.
     pub lines_per_keyframe: u8,
+}
+
+/// Twins run within 10° of each other; how far apart they lie says the rest.
+const TWIN_COSINE: f32 = 0.985;
+
+/// What becomes of a line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Fate {
+    /// It is a wall, or may become one.
+    Stays,
+    /// It was tentative.
+    Forgotten,
+    /// It is the same wall as this line.
+    IsOneWith(usize),
 }
 
 impl WallConfig {
@@ -42,12 +60,12 @@ impl WallConfig {
 
     fn is_bridge(&self, index: usize, entry: &MapSegment, map: &[MapSegment]) -> bool {
         let segment = &entry.segment;
-        let sines = self.angles_rad.map(libm::sinf);
+        let [least, most] = self.sines;
         let bears = |(other_index, other): &(usize, &MapSegment)| {
             let sine = cross(other.segment.direction, segment.direction).abs();
             *other_index != index
                 && other.hits >= entry.hits
-                && (sines[0]..=sines[1]).contains(&sine)
+                && (least..=most).contains(&sine)
                 && [segment.start, segment.end].iter().any(|end| self.lies_on(*end, &other.segment))
         };
         segment.length_m() <= self.max_bridge_m && map.iter().enumerate().any(|other| bears(&other))
@@ -60,19 +78,46 @@ impl WallConfig {
         (nearest - point).norm_squared() <= self.max_gap_m * self.max_gap_m
     }
 
-    /// Whether a line that is no wall was out of sight for so long that it is forgotten.
-    pub(crate) fn is_spent(&self, index: usize, map: &[MapSegment], way_m: f32) -> bool {
-        map.get(index).is_some_and(|entry| way_m - entry.seen_at_m > self.forget_m)
-            && !self.is_wall(index, map)
+    fn is_out_of_sight(&self, entry: &MapSegment, way_m: f32) -> bool {
+        way_m - entry.seen_at_m > self.forget_m
+    }
+
+    /// What becomes of a line once it is out of sight, after a way of `way_m`. Work: up to three steps for each line of the map.
+    pub(crate) fn fate(&self, index: usize, map: &[MapSegment], way_m: f32) -> Fate {
+        let Some(entry) = map.get(index).filter(|entry| self.is_out_of_sight(entry, way_m)) else {
+            return Fate::Stays;
+        };
+        if !self.is_wall(index, map) {
+            return Fate::Forgotten;
+        }
+        let is_twin = |(_, other): &(usize, &MapSegment)| {
+            (entry.seen_at_m - other.seen_at_m).abs() > self.revisit_m
+                && self.is_out_of_sight(other, way_m)
+                && self.lie_side_by_side(&entry.segment, &other.segment)
+        };
+        map.iter().enumerate().find(is_twin).map_or(Fate::Stays, |(twin, _)| Fate::IsOneWith(twin))
+    }
+
+    /// Whether two lines are the same side of a wall: at least half of the shorter one lies along the other.
+    fn lie_side_by_side(&self, a: &Segment, b: &Segment) -> bool {
+        let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
+        let line = long.line();
+        let is_near = |end: Point2<f32>| line.signed_distance(end).abs() <= self.max_twin_gap_m;
+        a.direction.dot(&b.direction) > TWIN_COSINE
+            && long.overlap_m(short) >= 0.5 * short.length_m()
+            && is_near(short.start)
+            && is_near(short.end)
     }
 
     pub(crate) fn validate(&self) -> Checked {
-        let [least, most] = self.angles_rad;
+        let [least, most] = self.sines;
         let fields = [
             ("walls.max_gap_m", self.max_gap_m),
-            ("walls.angles_rad", min(least, most - least)),
+            ("walls.sines", min(least, most - least)),
             ("walls.max_bridge_m", self.max_bridge_m),
             ("walls.forget_m", self.forget_m),
+            ("walls.revisit_m", self.revisit_m),
+            ("walls.max_twin_gap_m", self.max_twin_gap_m),
         ];
         fields.into_iter().try_for_each(|(field, value)| not_negative(field, value))
     }
@@ -128,10 +173,24 @@ mod tests {
         let least = config().min_hits;
         let map = [entry((0.0, 0.0), (3.0, 0.0), least), entry((0.0, 2.0), (3.0, 2.0), least - 1)];
         let way_m = map[0].seen_at_m + config().forget_m + 0.1;
-        let told = |index, way_m| (config().is_wall(index, &map), config().is_spent(index, &map, way_m));
-        assert_eq!(told(0, way_m), (true, false));
-        assert_eq!(told(1, way_m), (false, true));
-        assert_eq!(told(1, way_m - 0.2), (false, false));
-        assert_eq!(told(2, way_m), (false, false), "there is no third");
+        let told = |index, way_m| (config().is_wall(index, &map), config().fate(index, &map, way_m));
+        assert_eq!(told(0, way_m), (true, Fate::Stays));
+        assert_eq!(told(1, way_m), (false, Fate::Forgotten));
+        assert_eq!(told(1, way_m - 0.2), (false, Fate::Stays));
+        assert_eq!(told(2, way_m), (false, Fate::Stays), "there is no third");
+    }
+
+    #[test]
+    fn a_wall_of_two_visits_is_one_when_both_are_out_of_sight() {
+        let first = entry((0.0, 0.0), (3.0, 0.0), 9);
+        let later = |from, to| MapSegment { seen_at_m: 50.0, ..entry(from, to, 9) };
+        let of = |other: MapSegment, way_m| config().fate(0, &[first, other], way_m);
+        let again = later((1.0, 0.08), (4.0, 0.08));
+        assert_eq!(of(again, 70.0), Fate::IsOneWith(1));
+        assert_eq!(of(again, 55.0), Fate::Stays, "the second is in sight");
+        assert_eq!(of(later((1.0, 0.3), (4.0, 0.3)), 70.0), Fate::Stays, "too far apart");
+        assert_eq!(of(later((4.0, 0.08), (1.0, 0.08)), 70.0), Fate::Stays, "the wall's other side");
+        assert_eq!(of(later((2.5, 0.08), (5.0, 0.08)), 70.0), Fate::Stays, "the wall goes on");
+        assert_eq!(of(MapSegment { seen_at_m: 5.0, ..again }, 70.0), Fate::Stays, "seen on the same visit");
     }
 }

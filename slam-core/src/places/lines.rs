@@ -90,51 +90,52 @@ pub(super) fn unpacked(lines: &[PlaceLine]) -> Vec<Ray, PLACE_LINES> {
     lines.iter().filter_map(ray).take(PLACE_LINES).collect()
 }
 
-/// Most lines that are asked whether they are walls.
-const ASKED: usize = 3 * PLACE_LINES;
+/// Lines that are chosen from: those of most length and hits.
+const CANDIDATES: usize = 4 * PLACE_LINES;
 
 /// Chooses the lines of a place at `anchor` from those of the map that `counts` holds for: one after the other the one with most length
 /// and hits, where a line loses by each that runs like it and is there already. One that `is_wall` does not hold for, by its index, is
 /// passed over.
 ///
-/// Work: [`ASKED`] passes over the map, and as many questions, at most.
+/// Work: a pass over the map, and a question for each of [`CANDIDATES`] lines at most.
 pub(super) fn chosen(
     map: &[MapSegment],
     anchor: &Isometry2<f32>,
     counts: impl Fn(&MapSegment) -> bool,
     is_wall: impl Fn(usize) -> bool,
 ) -> PlaceLines {
-    let place_from_map = anchor.inverse();
-    let mut asked: Vec<u16, ASKED> = Vec::new();
-    let mut taken: Vec<u16, PLACE_LINES> = Vec::new();
-    let mut lines = PlaceLines::new();
-    while !taken.is_full() && !asked.is_full() {
-        let alike = |segment: &Segment| {
-            let same = taken
-                .iter()
-                .filter_map(|index| map.get(usize::from(*index)))
-                .filter(|other| cross(other.segment.direction, segment.direction).abs() < ALIKE_SINE);
-            same.count() as f32
-        };
-        let mut best: Option<(usize, f32)> = None;
-        for (index, entry) in map.iter().enumerate() {
-            let segment = &entry.segment;
-            if asked.contains(&(index as u16)) || !is_of(entry, anchor) || !counts(entry) {
-                continue;
-            }
-            let worth = min(segment.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS))
-                / (1.0 + alike(segment));
-            if worth > best.map_or(0.0, |(_, most)| most) {
-                best = Some((index, worth));
-            }
-        }
-        let Some((index, _)) = best else { break };
-        let _ = asked.push(index as u16);
-        if !is_wall(index) {
+    let mut candidates: Vec<(u16, f32), CANDIDATES> = Vec::new();
+    for (index, entry) in map.iter().enumerate() {
+        if !counts(entry) || !is_of(entry, anchor) {
             continue;
         }
-        let _ = taken.push(index as u16);
-        let ends = map.get(index).and_then(|e| clipped(&e.segment.transformed(&place_from_map)));
+        let worth = min(entry.segment.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS));
+        let candidate = (index as u16, worth);
+        if candidates.push(candidate).is_err()
+            && let Some(least) = candidates.iter_mut().min_by(|a, b| a.1.total_cmp(&b.1))
+            && least.1 < worth
+        {
+            *least = candidate;
+        }
+    }
+    let place_from_map = anchor.inverse();
+    let mut taken: Vec<&Segment, PLACE_LINES> = Vec::new();
+    let mut lines = PlaceLines::new();
+    while !taken.is_full() {
+        let alike = |segment: &Segment| {
+            let same =
+                taken.iter().filter(|other| cross(other.direction, segment.direction).abs() < ALIKE_SINE);
+            same.count() as f32
+        };
+        let worth = |(index, worth): &(u16, f32)| {
+            map.get(usize::from(*index)).map_or(0.0, |entry| worth / (1.0 + alike(&entry.segment)))
+        };
+        let valued = candidates.iter().enumerate().map(|(rank, candidate)| (rank, worth(candidate)));
+        let Some((rank, _)) = valued.min_by(|a, b| b.1.total_cmp(&a.1)) else { break };
+        let index = usize::from(candidates.remove(rank).0);
+        let Some(entry) = map.get(index).filter(|_| is_wall(index)) else { continue };
+        let _ = taken.push(&entry.segment);
+        let ends = clipped(&entry.segment.transformed(&place_from_map));
         if let Some(line) = ends.and_then(|[start, end]| PlaceLine::of(start, end)) {
             let _ = lines.push(line);
         }

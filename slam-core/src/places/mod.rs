@@ -139,6 +139,8 @@ pub struct Places<const P: usize> {
     support: Support,
     /// Loops have changed since the last solution began.
     is_stale: bool,
+    /// Of the newest places so many wait for their lines.
+    without_lines: u8,
 }
 
 impl<const P: usize> Places<P> {
@@ -158,6 +160,7 @@ impl<const P: usize> Places<P> {
             finder: Finder::new(),
             support: Support::NONE,
             is_stale: false,
+            without_lines: 0,
         }
     }
 
@@ -167,7 +170,7 @@ impl<const P: usize> Places<P> {
         self.loops.clear();
         self.solver.clear();
         self.finder = Finder::new();
-        (self.support, self.is_stale) = (Support::NONE, false);
+        (self.support, self.is_stale, self.without_lines) = (Support::NONE, false, 0);
     }
 
     /// The places.
@@ -180,9 +183,10 @@ impl<const P: usize> Places<P> {
         &self.loops
     }
 
-    /// Takes in a scan: a new place begins where the last lies far enough back, and the lines of that are chosen.
+    /// Takes in a scan: a new place begins where the last lies far enough back. Its lines, and once more those of the last, are chosen by
+    /// the next steps.
     ///
-    /// Work: for a new place, one pass over the chain, and 24 over the map; else a few steps.
+    /// Work: for a new place, one pass over the chain; else a few steps.
     pub(crate) fn visit(&mut self, visit: &Visit<'_>, config: &PlacesConfig) {
         self.support.add(&visit.motion, visit.verdict, visit.support);
         let is_due = self.chain.anchors.last().is_none_or(|last| {
@@ -191,11 +195,8 @@ impl<const P: usize> Places<P> {
         if !is_due {
             return;
         }
-        let is_wall = |index: usize| visit.walls.is_none_or(|walls| walls.is_wall(index, visit.map));
-        let seen_within =
-            |way_m: f32| move |entry: &MapSegment| (entry.seen_at_m - way_m).abs() <= config.seen_within_m;
-        if let Some(last) = self.chain.anchors.last_mut() {
-            last.lines = lines::chosen(visit.map, &last.pose, seen_within(last.way_m), is_wall);
+        while self.without_lines > 0 {
+            self.choose_lines(visit, config);
         }
         if self.chain.anchors.is_full() {
             self.make_room();
@@ -204,10 +205,24 @@ impl<const P: usize> Places<P> {
             return;
         }
         self.support = Support::NONE;
-        if let Some(own) = self.chain.anchors.last_mut() {
-            own.lines = lines::chosen(visit.map, &own.pose, seen_within(own.way_m), is_wall);
+        self.without_lines = self.chain.anchors.len().min(2) as u8;
+    }
+
+    /// Chooses the lines of the oldest place that waits for them; with those of the newest the search for loops begins.
+    ///
+    /// Work: one pass over the map, and one for each line that is chosen.
+    fn choose_lines(&mut self, visit: &Visit<'_>, config: &PlacesConfig) {
+        let places = self.chain.anchors.len();
+        let index = places.saturating_sub(usize::from(self.without_lines));
+        self.without_lines = self.without_lines.saturating_sub(1);
+        let Some(anchor) = self.chain.anchors.get_mut(index) else { return };
+        let way_m = anchor.way_m;
+        let seen_there = |entry: &MapSegment| (entry.seen_at_m - way_m).abs() <= config.seen_within_m;
+        let is_wall = |index: usize| visit.walls.is_none_or(|walls| walls.is_wall(index, visit.map));
+        anchor.lines = lines::chosen(visit.map, &anchor.pose, seen_there, is_wall);
+        if self.without_lines == 0 {
+            self.finder.begin(places as u16 - 1, &self.chain);
         }
-        self.finder.begin(self.chain.anchors.len() as u16 - 1, &self.chain);
     }
 
     /// Gives up the place that tells least.
@@ -227,16 +242,21 @@ impl<const P: usize> Places<P> {
         self.finder.removed(gone as u16);
     }
 
-    /// Steps for a scan after such a motion.
-    pub(crate) fn steps(motion: &Increment) -> u8 {
-        (1.0 + within(motion.distance_m / STEP_M, 0.0, f32::from(MOST_STEPS - 1))) as u8
+    /// Steps for a scan after such a motion; a keyframe has enough to do, and takes one of them.
+    pub(crate) fn steps(motion: &Increment, is_keyframe: bool) -> u8 {
+        let steps = (1.0 + within(motion.distance_m / STEP_M, 0.0, f32::from(MOST_STEPS - 1))) as u8;
+        steps - u8::from(is_keyframe)
     }
 
-    /// Does a bounded bit of work: one step of a solution that is on its way, else one of the search for loops. Returns what all around the
-    /// robot is to be moved by, where a solution has been swapped in.
+    /// Does a bounded bit of work: the lines of a place, or one step of a solution that is on its way, or one of the search for loops.
+    /// Returns what all around the robot is to be moved by, where a solution has been swapped in.
     ///
-    /// Work: that of [`Solver`]'s step, or eight places sieved, or two places compared.
-    pub(crate) fn step(&mut self, config: &PlacesConfig) -> Option<Closure> {
+    /// Work: a pass over the map for each line of a place, or that of [`Solver`]'s step, or eight places sieved, or two places compared.
+    pub(crate) fn step(&mut self, visit: &Visit<'_>, config: &PlacesConfig) -> Option<Closure> {
+        if self.without_lines > 0 {
+            self.choose_lines(visit, config);
+            return None;
+        }
         if self.solver.is_busy() {
             return self.solve();
         }

@@ -84,7 +84,7 @@ impl Drive {
         let visit =
             Visit { pose, motion, way_m, verdict: Verdict::Full, support: 0.9, map: &map, walls: None };
         self.places.visit(&visit, &CONFIG);
-        if let Some(closure) = self.places.step(&CONFIG) {
+        if let Some(closure) = self.places.step(&visit, &CONFIG) {
             self.closures += 1;
             self.estimate = closure.moved * self.estimate;
             for (way_m, pose, _) in &mut self.path {
