@@ -270,12 +270,14 @@ impl Mapping {
     /// A few segments of the map that was asked for, so that the log keeps up.
     fn print_map(&mut self) {
         if PRINT_MAP.swap(false, Ordering::Relaxed) {
-            defmt::info!("map: {=usize} segments", self.keeper.mapper().slam().map().segments().len());
+            defmt::info!("walls of the map");
             self.printing = Some(0);
         }
         let Some(from) = self.printing else { return };
-        let map = self.keeper.mapper().slam().map().segments();
-        for entry in map.iter().skip(from).take(PRINT_AT_ONCE) {
+        let slam = self.keeper.mapper().slam();
+        let map = slam.map().segments();
+        let next_few = map.iter().enumerate().skip(from).take(PRINT_AT_ONCE);
+        for (_, entry) in next_few.filter(|(index, _)| slam.is_wall(*index)) {
             let (a, b) = (entry.segment.start, entry.segment.end);
             defmt::info!(
                 "segment {=f32} {=f32} {=f32} {=f32} points {=u32} scans {=u16}",

@@ -26,7 +26,7 @@ const LONGEST_US: u64 = 3_600_000_000;
 const BUDGET: [u32; 2] = [200_000, 600_000];
 const BUDGET_SEGMENTS: usize = 200;
 /// Instructions of any scan in which the pose is searched for, whatever the map.
-const SEARCH_BUDGET: u32 = 2_030_000;
+const SEARCH_BUDGET: u32 = 2_000_000;
 /// Between two scans.
 const SCAN_S: f64 = 0.1;
 

@@ -61,7 +61,7 @@ fn default_beats_the_paper_and_dead_reckoning_on_every_log() {
         let ours = replay(&path, SlamConfig::default());
         let paper = replay(&path, SlamConfig::paper());
         let error = |text: String| error_m(&text, recorded);
-        let default_m = error(tum::render(replay::trajectory(&ours.steps)));
+        let default_m = error(tum::render(replay::final_trajectory(&ours.steps)));
         let paper_m = error(tum::render(replay::trajectory(&paper.steps)));
         let odometry_m = error(tum::render(replay::dead_reckoning(&ours.steps)));
         let metres = |m: f64| format!("{m:.3}");
@@ -102,7 +102,7 @@ fn promises_hold_with_other_noise() {
             }
             let robot = Robot::usual_for(log.format);
             let result = replay::run(&log, &robot, SlamConfig::default(), || {}).unwrap();
-            let error = error_m(&tum::render(replay::trajectory(&result.steps)), recorded);
+            let error = error_m(&tum::render(replay::final_trajectory(&result.steps)), recorded);
             assert!(error <= recorded.noisy_limit_m, "{} with seed {seed}: {error:.3} m", recorded.name);
         }
     }

@@ -81,7 +81,8 @@ pub struct SlamConfig {
     pub forgetting: Option<ForgetConfig>,
     /// Cutting of what was seen through or driven through in part; together with forgetting only.
     pub openings: Option<OpeningConfig>,
-    /// Walls told from what is tentative, or every line taken for a wall.
+    /// Walls told from what is tentative, or every line taken for a wall; what is tentative is forgotten together with what is seen
+    /// through.
     pub walls: Option<WallConfig>,
     /// Segments to map.
     pub registration: RegistrationConfig,

@@ -49,6 +49,9 @@ pub(crate) struct Surroundings<'a, const N: usize> {
     pub tracker: &'a mut Tracker<N>,
 }
 
+/// Where updates of the filter follow each other, lines are looked at once the robot has gone on by more than this, metres.
+const LONG_WAY_M: f32 = 0.2;
+
 /// The pose, its covariance, the filter, and where the filter stands.
 ///
 /// RAM: 24 KiB.
@@ -187,6 +190,8 @@ impl Estimator {
             self.advance(around);
             self.set_anchor();
         }
+        // Where the robot went unseen is no way on which lines were crossed.
+        self.restart_way();
         is_usable
     }
 
@@ -399,6 +404,12 @@ impl Estimator {
     /// The pose has jumped: that is no way on which lines were crossed.
     pub fn restart_way(&mut self) {
         self.opened_from = self.map_from_base.translation.vector.into();
+    }
+
+    /// Whether the robot has gone on so far since lines were looked at last that its way is hardly straight any more.
+    pub fn is_way_long(&self) -> bool {
+        let way = self.map_from_base.translation.vector - self.opened_from.coords;
+        way.norm_squared() > LONG_WAY_M * LONG_WAY_M
     }
 
     /// Opens the lines nearby that the robot has crossed since they were looked at last, or that beams went through in part. While an

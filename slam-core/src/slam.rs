@@ -68,6 +68,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             self.register(&mut update, watch);
             self.forget(scan, &update);
             self.keep_places(&by_odometry, &mut update);
+        } else {
+            self.places.pass_blindly(&by_odometry);
         }
         self.finish(&mut update);
         update
@@ -79,6 +81,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         let is_usable = estimator.coast(motion, &mut around);
         self.counters.count_motion(is_usable);
         self.counters.coasted = self.counters.coasted.saturating_add(1);
+        self.places.pass_blindly(motion);
         self.estimator.pose()
     }
 
@@ -98,6 +101,10 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         let (estimator, mut around) = self.estimator();
         let is_usable = estimator.predict(motion, &mut around);
         self.counters.count_motion(is_usable);
+        if self.estimator.is_way_long() {
+            // Between the commit of one keyframe's update and the next keyframe.
+            self.open_lines(None);
+        }
         self.estimator.local()
     }
 
@@ -177,29 +184,39 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
 
     /// Forgets what a keyframe has seen through, and opens what the robot or beams went through in part.
     fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
-        let Some(config) = self.config.forgetting.filter(|_| update.corrected) else { return };
-        let Self { config: SlamConfig { sensor, openings, line_noise, .. }, estimator, tracker, map, .. } =
-            self;
-        let (pose, stamp) = (estimator.pose(), estimator.stamp());
+        // What is seen from a wrong pose, and the way there, says nothing of the map.
+        let is_sure = update.corrected && update.state != TrackingState::Lost;
+        let Some(config) = self.config.forgetting.filter(|_| is_sure) else {
+            self.estimator.restart_way();
+            return;
+        };
+        let Self { config: SlamConfig { sensor, .. }, estimator, tracker, map, .. } = self;
+        let (sensor, pose, stamp) = (*sensor, estimator.pose(), estimator.stamp());
         // As the registration left them: fusing may have moved segments.
         let nearby = tracker.nearby.all();
-        let view = View::new(scan, &pose, sensor, &config);
+        let view = View::new(scan, &pose, &sensor, &config);
         if update.registration.keyframe {
             mark_seen_through(&view, stamp.scan, nearby, map);
         }
-        if let Some(openings) = openings {
-            // A scan that searches has enough to do.
-            let view = Some(&view).filter(|_| update.registration.committed && !update.searched);
-            estimator.open_lines(openings, line_noise, nearby, view, map);
-        }
+        // A scan that searches has enough to do.
+        self.open_lines(Some(&view).filter(|_| update.registration.committed && !update.searched));
         if !update.registration.keyframe {
             return;
         }
+        let Self { estimator, map, .. } = self;
         while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {
             estimator.forget_line(index, map);
         }
         if let Some(walls) = &self.config.walls {
             estimator.tidy(walls, map);
+        }
+    }
+
+    /// Opens what the robot, and beams where there is a view, went through in part.
+    fn open_lines(&mut self, view: Option<&View<'_, '_>>) {
+        let Self { config: SlamConfig { openings, line_noise, .. }, estimator, tracker, map, .. } = self;
+        if let Some(openings) = openings {
+            estimator.open_lines(openings, line_noise, tracker.nearby.all(), view, map);
         }
     }
 
@@ -216,7 +233,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             walls: self.config.walls.as_ref(),
         };
         self.places.visit(&visit, &config);
-        for _ in 0..Places::<P>::steps(motion, update.registration.keyframe) {
+        for _ in 0..self.places.steps(motion, update.registration.keyframe) {
             // One at most for each scan: who asks how the places have moved must not miss any.
             update.closure = self.places.step(&visit, &config);
             if let Some(closure) = update.closure {
@@ -224,6 +241,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
                 let mut around =
                     Surroundings { config, odometry, observed: frontend.segments(), map, tracker };
                 estimator.carry(&closure.moved, places, &mut around);
+                odometry.map_moved();
                 update.predicted = closure.moved * update.predicted;
                 break;
             }

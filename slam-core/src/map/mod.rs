@@ -162,9 +162,15 @@ impl<const N: usize> SegmentMap<N> {
             }
         };
         entry.segment = kept;
-        let entry = *entry;
         self.counters.opened = self.counters.opened.saturating_add(1);
-        self.insert_entry(MapSegment { segment: other?, ..entry }, now)
+        let whole = *entry;
+        // It must not give way to its own part.
+        entry.last_seen = now;
+        let part = other.and_then(|segment| self.insert_entry(MapSegment { segment, ..whole }, now));
+        if let Some(entry) = self.segments.get_mut(index) {
+            entry.last_seen = whole.last_seen;
+        }
+        part
     }
 
     /// Forgets the segments that are not finite.

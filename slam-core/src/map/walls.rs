@@ -1,9 +1,9 @@
 //! Which lines of the map are walls.
 //!
 //! In: the lines of the map. Out: those that stand, and those that are tentative. Where a recess, a door frame or a corner is seen at a slant,
-//! points before and behind the edge make one line, which lies on neither surface. Such a line is seen from a few places only, and bridges
-//! two lines: its ends lie on lines that are seen at least as often and run at another angle. A wall that stands askew between two others
-//! is left out too, unless it is long. What is tentative helps to track the pose while it is in view; it is not shown, begins no
+//! points before and behind the edge make one line, which lies on neither surface. Such a line is seen from a few places only, and an end of it
+//! lies on a line that is seen more often and runs at another angle: it is a bridge. A wall that begins askew at another is left out too,
+//! unless it is long, or seen as often. What is tentative helps to track the pose while it is in view; it is not shown, begins no
 //! loops, and is forgotten once the robot has gone on.
 
 use nalgebra::Point2;
@@ -22,7 +22,7 @@ use crate::map::MapSegment;
 pub struct WallConfig {
     /// Keyframes that must have seen it.
     pub min_hits: u16,
-    /// A bridge's end is not farther from the line on which it lies than this, metres, …
+    /// One end of a bridge is not farther from the line on which it lies than this, metres, …
     pub max_gap_m: f32,
     /// … and the sine of the angle between them is one of this range.
     pub sines: [f32; 2],
@@ -64,7 +64,7 @@ impl WallConfig {
         let bears = |(other_index, other): &(usize, &MapSegment)| {
             let sine = cross(other.segment.direction, segment.direction).abs();
             *other_index != index
-                && other.hits >= entry.hits
+                && other.hits > entry.hits
                 && (least..=most).contains(&sine)
                 && [segment.start, segment.end].iter().any(|end| self.lies_on(*end, &other.segment))
         };
@@ -90,10 +90,11 @@ impl WallConfig {
         if !self.is_wall(index, map) {
             return Fate::Forgotten;
         }
-        let is_twin = |(_, other): &(usize, &MapSegment)| {
+        let is_twin = |(other_index, other): &(usize, &MapSegment)| {
             (entry.seen_at_m - other.seen_at_m).abs() > self.revisit_m
                 && self.is_out_of_sight(other, way_m)
                 && self.lie_side_by_side(&entry.segment, &other.segment)
+                && self.is_wall(*other_index, map)
         };
         map.iter().enumerate().find(is_twin).map_or(Fate::Stays, |(twin, _)| Fate::IsOneWith(twin))
     }

@@ -60,6 +60,11 @@ impl OdometryHealth {
         self.monitor.is_useless()
     }
 
+    /// The map, and the robot in it, was moved: the way at hand says nothing of the odometry.
+    pub fn map_moved(&mut self) {
+        self.learning.interrupt();
+    }
+
     /// What is wrong with the wheels, where that is known.
     pub fn wheel_fault(&self) -> Option<WheelFault> {
         self.wheels.fault()

@@ -62,6 +62,8 @@ pub struct Support {
     is_low: bool,
 }
 
+/// A motion that is no number counts as this way unseen, metres.
+const UNKNOWN_M: f32 = 1.0;
 /// Less explained than this is hardly explained.
 const LOW_SUPPORT: f32 = 0.7;
 
@@ -71,6 +73,11 @@ impl Support {
 
     /// Takes in a motion, and what the scan after it made of the pose.
     pub fn add(&mut self, motion: &Increment, verdict: Verdict, support: f32) {
+        if !motion.is_finite() {
+            self.blind_m += UNKNOWN_M;
+            self.is_low = true;
+            return;
+        }
         self.way_m += motion.distance_m;
         self.turn_rad += motion.turn_rad.abs();
         match verdict {
@@ -172,8 +179,17 @@ impl<const P: usize> Chain<P> {
 
     /// Prefix sum of the variances of the edges up to an anchor, about the origin.
     pub(super) fn spread_until(&self, index: usize) -> Matrix3<f64> {
-        let edges = self.anchors.iter().take(index + 1).skip(1);
-        edges.fold(Matrix3::zeros(), |sum, anchor| sum + anchor.spread(&anchor.pose))
+        self.spreads_until([index, index])[1]
+    }
+
+    /// The same up to two anchors, the earlier one first, in one pass.
+    pub(super) fn spreads_until(&self, [first, second]: [usize; 2]) -> [Matrix3<f64>; 2] {
+        let edges = |from: usize, to: usize| self.anchors.iter().take(to + 1).skip(from.saturating_add(1));
+        let sum = |start, from, to| {
+            edges(from, to).fold(start, |sum, anchor: &Anchor| sum + anchor.spread(&anchor.pose))
+        };
+        let before = sum(Matrix3::zeros(), 0, first);
+        [before, sum(before, first, second)]
     }
 }
 

@@ -24,7 +24,7 @@ const CANDIDATES: usize = 8;
 const SIEVED: usize = 8;
 /// Matches that wait to be confirmed.
 const PENDING: usize = 12;
-/// Loops taken at once.
+/// Loops judged, and taken, at once.
 const AT_ONCE: usize = 3;
 /// Places after which a match that was not confirmed is dropped.
 const WAIT: u16 = 3;
@@ -83,7 +83,7 @@ pub(super) struct Known<'a, const P: usize> {
 impl<const P: usize> Known<'_, P> {
     /// Covariance of a place seen from an older one, in its own frame, given the loops; by the prefix sums of both.
     ///
-    /// Work: 27 steps in `f32` for each loop, and half the square of the factor's rows, three times.
+    /// Work: 54 steps in `f32` for each loop, and half the square of the factor's rows, three times.
     fn covariance(&self, from: u16, before: &Packed, to: u16, until: &Packed) -> Matrix3<f32> {
         let Some(anchor) = self.chain.get(usize::from(to)) else { return Matrix3::identity() };
         let to_own = inverse_adjoint(&anchor.pose);
@@ -136,10 +136,10 @@ impl<const P: usize> Known<'_, P> {
             && off.z.abs() <= self.config.same_heading_rad
     }
 
-    /// Whether the chain has nothing against a loop, and how much it learns from it, nats.
+    /// Whether the chain has nothing against a loop, and how much it learns from it, nats. Work: one pass over the chain in `f64`.
     fn gain(&self, tie: &Loop) -> Option<f32> {
-        let (before, until) =
-            [tie.from, tie.to].map(|k| Packed::of(&self.chain.spread_until(k.into()))).into();
+        let [before, until] =
+            self.chain.spreads_until([tie.from, tie.to].map(usize::from)).map(|s| Packed::of(&s));
         let innovation = self.covariance(tie.from, &before, tie.to, &until) + tie.covariance;
         let off = components(&self.pose(tie.from).inv_mul(&self.pose(tie.to)).inv_mul(&tie.measured));
         let chi2 = off.dot(&(innovation.try_inverse()? * off));
@@ -171,6 +171,18 @@ impl Finder {
         self.pending.retain(|p| place.saturating_sub(p.tie.to) <= WAIT);
         let spread = Packed::of(&chain.spread_until(place.into()));
         self.query = Some(Query { place, spread, next: Some((0, Packed::ZERO)) });
+    }
+
+    /// The places have moved: what is under way begins anew.
+    pub fn begin_anew<const P: usize>(&mut self, chain: &Chain<P>) {
+        if let Some(query) = self.query {
+            self.begin(query.place, chain);
+        }
+    }
+
+    /// Gives up waiting for confirmation.
+    pub fn drop_pending(&mut self) {
+        self.pending.clear();
     }
 
     /// Whether an anchor is needed.
@@ -245,6 +257,8 @@ impl Finder {
     }
 
     /// Which matches of the place that is through are to be believed, with those they confirm.
+    ///
+    /// Work: [`AT_ONCE`] loops judged, and where there is no more room, the one that tells least looked for.
     fn decide<const P: usize>(&mut self, known: &Known<'_, P>) -> (Vec<Loop, AT_ONCE>, Option<usize>) {
         let confirmed = |m: &Found| {
             known.config.confirmations == 0
@@ -263,18 +277,28 @@ impl Finder {
         let mut order: Vec<u8, PENDING> = (0..self.pending.len() as u8).collect();
         let share = |k: &u8| self.pending.get(usize::from(*k)).map_or(0.0, |p| p.share);
         order.sort_unstable_by(|a, b| share(b).total_cmp(&share(a)));
+        let mut judged = 0;
+        let mut least_telling = None;
         for k in order {
             let Some(found) = self.pending.get_mut(usize::from(k)) else { continue };
             let is_new = new.iter().any(|m| m.tie.to == found.tie.to && m.tie.from == found.tie.from);
-            if found.taken || !(is_new || agrees(found)) || taken.is_full() {
+            if found.taken || !(is_new || agrees(found)) {
                 continue;
             }
+            if judged == AT_ONCE {
+                break;
+            }
+            judged += 1;
             let Some(gain) = known.gain(&found.tie).filter(|gain| *gain >= known.config.min_gain) else {
                 continue;
             };
             if known.loops.len() + taken.len() >= LOOPS {
                 // One at a time: the factor knows the loops as they are.
-                let Some((index, least)) = known.least_telling().filter(|_| taken.is_empty()) else { break };
+                if !taken.is_empty() {
+                    break;
+                }
+                least_telling = least_telling.or_else(|| known.least_telling());
+                let Some((index, least)) = least_telling else { break };
                 if least >= gain {
                     continue;
                 }

@@ -125,7 +125,7 @@ pub struct Closure {
 }
 
 /// A robot whose scans lie far apart has the time for more steps: one more for this way between scans, metres, …
-const STEP_M: f32 = 0.1;
+const STEP_M: f32 = 0.06;
 /// … but not more than this.
 const MOST_STEPS: u8 = 12;
 
@@ -141,6 +141,8 @@ pub struct Places<const P: usize> {
     is_stale: bool,
     /// Of the newest places so many wait for their lines.
     without_lines: u8,
+    /// The last scan was a keyframe that left no step.
+    rested: bool,
 }
 
 impl<const P: usize> Places<P> {
@@ -161,6 +163,7 @@ impl<const P: usize> Places<P> {
             support: Support::NONE,
             is_stale: false,
             without_lines: 0,
+            rested: false,
         }
     }
 
@@ -186,7 +189,7 @@ impl<const P: usize> Places<P> {
     /// Takes in a scan: a new place begins where the last lies far enough back. Its lines, and once more those of the last, are chosen by
     /// the next steps.
     ///
-    /// Work: for a new place, one pass over the chain; else a few steps.
+    /// Work: a few steps; where a full chain has to give up a place, half the square of the places.
     pub(crate) fn visit(&mut self, visit: &Visit<'_>, config: &PlacesConfig) {
         self.support.add(&visit.motion, visit.verdict, visit.support);
         let is_due = self.chain.anchors.last().is_none_or(|last| {
@@ -210,7 +213,7 @@ impl<const P: usize> Places<P> {
 
     /// Chooses the lines of the oldest place that waits for them; with those of the newest the search for loops begins.
     ///
-    /// Work: one pass over the map, and one for each line that is chosen.
+    /// Work: one pass over the map, and one for each of 48 lines at most that are asked whether they are walls.
     fn choose_lines(&mut self, visit: &Visit<'_>, config: &PlacesConfig) {
         let places = self.chain.anchors.len();
         let index = places.saturating_sub(usize::from(self.without_lines));
@@ -235,6 +238,8 @@ impl<const P: usize> Places<P> {
         let is_end =
             |index: usize| loops.iter().any(|l| usize::from(l.from) == index || usize::from(l.to) == index);
         let Some(gone) = self.chain.least_telling(|index| is_end(index) || finder.needs(index)) else {
+            // Next time there is one.
+            self.finder.drop_pending();
             return;
         };
         self.chain.remove(gone);
@@ -242,16 +247,22 @@ impl<const P: usize> Places<P> {
         self.finder.removed(gone as u16);
     }
 
-    /// Steps for a scan after such a motion; a keyframe has enough to do, and takes one of them.
-    pub(crate) fn steps(motion: &Increment, is_keyframe: bool) -> u8 {
+    /// Steps for a scan after such a motion. A keyframe has enough to do and takes one of them, but not the only one twice in a row.
+    pub(crate) fn steps(&mut self, motion: &Increment, is_keyframe: bool) -> u8 {
         let steps = (1.0 + within(motion.distance_m / STEP_M, 0.0, f32::from(MOST_STEPS - 1))) as u8;
-        steps - u8::from(is_keyframe)
+        self.rested = is_keyframe && steps == 1 && !self.rested;
+        if self.rested || (is_keyframe && steps > 1) { steps - 1 } else { steps }
+    }
+
+    /// The robot moved where no scan was taken in.
+    pub(crate) fn pass_blindly(&mut self, motion: &Increment) {
+        self.support.add(motion, Verdict::Blind, 0.0);
     }
 
     /// Does a bounded bit of work: the lines of a place, or one step of a solution that is on its way, or one of the search for loops.
     /// Returns what all around the robot is to be moved by, where a solution has been swapped in.
     ///
-    /// Work: a pass over the map for each line of a place, or that of [`Solver`]'s step, or eight places sieved, or two places compared.
+    /// Work: the lines of a place, or that of [`Solver`]'s step, or eight places sieved, or two places compared, or three loops judged.
     pub(crate) fn step(&mut self, visit: &Visit<'_>, config: &PlacesConfig) -> Option<Closure> {
         if self.without_lines > 0 {
             self.choose_lines(visit, config);
@@ -289,6 +300,7 @@ impl<const P: usize> Places<P> {
             }
             Progress::Done => {
                 self.solver.swap_in(&mut self.chain);
+                self.finder.begin_anew(&self.chain);
                 let (old, new) = (self.solver.replaced().last()?, self.chain.anchors.last()?.pose);
                 Some(Closure { moved: normalized(&(new * old.inverse())) })
             }

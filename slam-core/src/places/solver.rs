@@ -67,7 +67,7 @@ pub enum Progress {
     Failed,
 }
 
-/// A solution on its way. RAM: 16·`P` bytes and 14 KiB.
+/// A solution on its way. RAM: 16·`P` bytes and 7 KiB.
 #[derive(Clone, Debug)]
 pub struct Solver<const P: usize> {
     /// On the way those of the solution, afterwards those it replaced.

@@ -84,12 +84,16 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         &self.config
     }
 
-    /// The lines of the map that stand: walls, without what is tentative. Work: for each, that of
-    /// [`WallConfig::is_wall`](crate::map::walls::WallConfig::is_wall).
+    /// The lines of the map that stand: walls, without what is tentative. Work: for each, that of [`Self::is_wall`].
     pub fn walls(&self) -> impl Iterator<Item = &MapSegment> {
-        let (walls, map) = (self.config.walls, self.map.segments());
-        let stands = move |index: usize| walls.is_none_or(|walls| walls.is_wall(index, map));
-        map.iter().enumerate().filter(move |(index, _)| stands(*index)).map(|(_, entry)| entry)
+        let lines = self.map.segments().iter().enumerate();
+        lines.filter(|(index, _)| self.is_wall(*index)).map(|(_, entry)| entry)
+    }
+
+    /// Whether the line of the map with this index stands, or is tentative. Work: that of
+    /// [`WallConfig::is_wall`](crate::map::walls::WallConfig::is_wall).
+    pub fn is_wall(&self, index: usize) -> bool {
+        self.config.walls.is_none_or(|walls| walls.is_wall(index, self.map.segments()))
     }
 
     /// The map.
