@@ -23,7 +23,8 @@ pub fn everything() -> anyhow::Result<()> {
         "-p scip",
         "-p scip --all-features",
         "-p footprint",
-        "-p bench-target",
+        // As it is built: it makes its scans with the whole command, which is not to be built twice.
+        "--release -p bench-target",
         "-p firmware",
         "-p firmware --features hang,sleeps",
     ] {
