@@ -175,7 +175,7 @@ fn estimated_delay_s(outcome: &Outcome) -> Option<[f32; 2]> {
 
 /// The map that the firmware printed last when its button was pressed.
 fn printed_map(outcome: &Outcome) -> anyhow::Result<Vec<MapSegment>> {
-    let is_head = |text: &str| text.starts_with("map: ") && text.ends_with(" segments");
+    let is_head = |text: &str| text == "walls of the map";
     let from = outcome.log.iter().rposition(|l| is_head(&l.text));
     let lines = from.and_then(|n| outcome.log.get(n + 1..)).unwrap_or(&[]);
     let mut map = Vec::new();
