@@ -8,6 +8,9 @@
 //! each scan, and gathers in its error state what they say of pose, odometry and lines. [`Estimator::commit`] injects the error
 //! state: pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
 
+mod recovery;
+mod upkeep;
+
 use nalgebra::{Isometry2, Matrix3, Point2, Vector3};
 
 use crate::config::SlamConfig;
@@ -17,20 +20,15 @@ use crate::ekf::keyframe::{Anchor, Keyframe, KeyframeConfig, LocalVariance};
 use crate::ekf::keyframe_update::{
     KeyframeUpdate, LinearizationPoint, Observed, RegistrationReport, SensorModel, Stamp,
 };
-use crate::ekf::line_map::LineMap;
 use crate::geometry::line_noise::LineNoise;
-use crate::geometry::pose::{heading, is_finite, normalized, perpendicular, rotate_covariance};
+use crate::geometry::pose::{is_finite, normalized, perpendicular, rotate_covariance};
 use crate::geometry::segment::Segment;
 use crate::map::SegmentMap;
-use crate::map::openings::{OpeningConfig, opening};
-use crate::map::visibility::View;
-use crate::map::walls::{Fate, WallConfig};
 use crate::odometry::Increment;
 use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
 use crate::odometry::track::ScanMotion;
 use crate::paper::end_points::register_end_points;
-use crate::places::Places;
 use crate::tracking::correction::Prior;
 use crate::tracking::{Hypothesis, Tracker, TrackingState};
 use crate::update::SlamUpdate;
@@ -48,9 +46,6 @@ pub(crate) struct Surroundings<'a, const N: usize> {
     /// Those around the robot, and their pairs among the segments.
     pub tracker: &'a mut Tracker<N>,
 }
-
-/// Where updates of the filter follow each other, lines are looked at once the robot has gone on by more than this, metres.
-const LONG_WAY_M: f32 = 0.2;
 
 /// The pose, its covariance, the filter, and where the filter stands.
 ///
@@ -206,8 +201,7 @@ impl Estimator {
         self.inflate_filter(by, around);
     }
 
-    /// The same of the filter's pose only: that of the scan at hand is known from the scan.
-    /// Whether an update was committed with it.
+    /// The same of the filter's pose only: that of the scan at hand is known from the scan. Whether an update was committed with it.
     fn inflate_filter<const N: usize>(
         &mut self,
         by: &Matrix3<f32>,
@@ -341,141 +335,6 @@ impl Estimator {
         report
     }
 
-    /// Moves with the places, which loops have corrected: the pose, the filter and what was seen on the last `local_m` by `moved`, as
-    /// one, so that tracking notices nothing; older lines with the places around which they were seen. Those leave the filter's state:
-    /// what they have in common with the pose is not known any more.
-    pub fn carry<const N: usize, const P: usize>(
-        &mut self,
-        moved: &Isometry2<f32>,
-        places: &Places<P>,
-        around: &mut Surroundings<'_, N>,
-    ) {
-        let Some(config) = around.config.places else { return };
-        self.commit(around);
-        for index in 0..around.map.segments().len() {
-            let Some(entry) = around.map.get_mut(index) else { continue };
-            let is_local = self.travelled_m - entry.seen_at_m <= config.local_m;
-            let by = if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.segment.midpoint()) };
-            let segment = entry.segment.transformed(&by);
-            if segment.is_finite() {
-                entry.segment = segment;
-            }
-            if let Some(filter) = self.filter.as_mut().filter(|_| !is_local) {
-                filter.decouple_line(index, around.map);
-            }
-        }
-        if let Some(filter) = &mut self.filter {
-            filter.turn_pose(heading(moved));
-        }
-        self.local_covariance = rotate_covariance(moved, &self.local_covariance);
-        self.keyframe.map_from_base = normalized(&(moved * self.keyframe.map_from_base));
-        self.map_from_base = normalized(&(moved * self.map_from_base));
-        self.set_anchor();
-        self.restart_way();
-    }
-
-    /// Forgets a line of the map.
-    pub fn forget_line<const N: usize>(&mut self, index: usize, map: &mut SegmentMap<N>) {
-        match &mut self.filter {
-            Some(filter) => LineMap { map, filter }.remove(index),
-            None => map.forget(index),
-        }
-    }
-
-    /// Of the next few lines out of sight forgets what is tentative, and makes one of what is the same wall.
-    ///
-    /// Work: that of [`WallConfig::fate`] for [`WallConfig::lines_per_keyframe`] lines.
-    pub fn tidy<const N: usize>(&mut self, config: &WallConfig, map: &mut SegmentMap<N>) {
-        for _ in 0..config.lines_per_keyframe {
-            let index = usize::from(self.next_tidied).min(map.segments().len());
-            self.next_tidied = if index < map.segments().len() { index as u16 + 1 } else { 0 };
-            let hits = |index: usize| map.segments().get(index).map_or(0, |entry| entry.hits);
-            match (config.fate(index, map.segments(), self.travelled_m), &mut self.filter) {
-                (Fate::Forgotten, _) => self.forget_line(index, map),
-                (Fate::IsOneWith(twin), Some(filter)) => {
-                    let (kept, gone) = if hits(twin) > hits(index) { (twin, index) } else { (index, twin) };
-                    LineMap { map, filter }.merge(kept, gone);
-                }
-                _ => {}
-            }
-        }
-    }
-
-    /// The pose has jumped: that is no way on which lines were crossed.
-    pub fn restart_way(&mut self) {
-        self.opened_from = self.map_from_base.translation.vector.into();
-    }
-
-    /// Whether the robot has gone on so far since lines were looked at last that its way is hardly straight any more.
-    pub fn is_way_long(&self) -> bool {
-        let way = self.map_from_base.translation.vector - self.opened_from.coords;
-        way.norm_squared() > LONG_WAY_M * LONG_WAY_M
-    }
-
-    /// Opens the lines nearby that the robot has crossed since they were looked at last, or that beams went through in part. While an
-    /// update of the filter is pending, that waits.
-    ///
-    /// Work: two steps for each line, and the look-ups of [`OpeningConfig::lines_per_scan`] of them.
-    pub fn open_lines<const N: usize>(
-        &mut self,
-        config: &OpeningConfig,
-        noise: &LineNoise,
-        nearby: &[u16],
-        view: Option<&View<'_, '_>>,
-        map: &mut SegmentMap<N>,
-    ) {
-        if self.update.is_pending() {
-            return;
-        }
-        let stamp = self.stamp();
-        let first = usize::from(self.next_opened);
-        if view.is_some() {
-            self.next_opened = self.next_opened.wrapping_add(config.lines_per_scan.into());
-        }
-        let here = self.map_from_base.translation.vector.into();
-        let way = [core::mem::replace(&mut self.opened_from, here), here];
-        for (rank, index) in nearby.iter().copied().map(usize::from).enumerate() {
-            let Some(entry) = map.segments().get(index).filter(|e| e.hits >= config.min_hits) else {
-                continue;
-            };
-            let segment = entry.segment;
-            let view = view.filter(|_| config.looks_at(rank, nearby.len(), first));
-            let Some(opening) = opening(&segment, way, view, config) else { continue };
-            let parts = opening.cut(&segment);
-            match &mut self.filter {
-                Some(filter) => LineMap { map, filter }.cut(index, parts, noise, &stamp),
-                None => _ = map.cut(index, parts, stamp.scan),
-            }
-        }
-    }
-
-    /// Begins anew at a pose that is taken as certain.
-    pub fn begin_at(&mut self, map_from_base: Isometry2<f32>, config: &SlamConfig) {
-        self.map_from_base = map_from_base;
-        self.restart_way();
-        self.local_covariance = Matrix3::zeros();
-        self.begin_anew(config);
-    }
-
-    /// Begins anew from where the robot stands. Of the filter only the odometry's errors stay.
-    pub fn begin_anew(&mut self, config: &SlamConfig) {
-        if let Some(filter) = &mut self.filter {
-            filter.clear(config.odometry.bias_sigmas());
-        }
-        self.update.clear();
-        self.keyframe = Keyframe::at(self.map_from_base, LocalVariance::default());
-        self.set_anchor();
-    }
-
-    /// Puts the pose in order after a reset that may have come while it was written. False where it is lost.
-    pub fn recover_pose(&mut self) -> bool {
-        let is_whole = is_finite(&self.map_from_base) && self.local_covariance.iter().all(|v| v.is_finite());
-        if is_whole {
-            self.map_from_base = normalized(&self.map_from_base);
-        }
-        is_whole
-    }
-
     /// Moves the filter's pose on by what the odometry said since the last keyframe. Returns it.
     fn advance<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) -> Isometry2<f32> {
         let last = self.keyframe;
@@ -523,165 +382,4 @@ fn by_odometry(from: &Isometry2<f32>, increment: &Increment) -> Matrix3<f32> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::geometry::pose::{components, difference, exp, pose};
-    use nalgebra::Point2;
-
-    /// All that an estimator works with, around a robot that has seen nothing.
-    struct Robot {
-        config: SlamConfig,
-        odometry: OdometryHealth,
-        map: SegmentMap<8>,
-        tracker: Tracker<8>,
-        estimator: Estimator,
-    }
-
-    impl Robot {
-        fn new(config: SlamConfig) -> Self {
-            let mut estimator = Estimator::blank();
-            estimator.prepare(&config);
-            let odometry = OdometryHealth::new(config.line_noise, config.odometry.noise);
-            Self { config, odometry, map: SegmentMap::new(), tracker: Tracker::new(), estimator }
-        }
-
-        fn with<'a>(&'a mut self, observed: &'a [Segment]) -> (&'a mut Estimator, Surroundings<'a, 8>) {
-            let Self { config, odometry, map, tracker, estimator } = self;
-            (estimator, Surroundings { config, odometry, observed, map, tracker })
-        }
-
-        /// A scan that changes nothing of the pose.
-        fn see(&mut self, observed: &[Segment]) -> RegistrationReport {
-            let (estimator, mut around) = self.with(observed);
-            let update = SlamUpdate::predicted(&estimator.local(), TrackingState::Tracking);
-            let report = estimator.register(&update, &mut around);
-            estimator.end_scan();
-            report
-        }
-
-        fn go(&mut self, x: f32, y: f32, turn: f32) -> bool {
-            let (estimator, mut around) = self.with(&[]);
-            let increment = Increment::from_motion(pose(x, y, turn));
-            estimator.predict(&ScanMotion::instantaneous(increment), &mut around)
-        }
-    }
-
-    fn wall() -> Segment {
-        Segment::from_ends(Point2::new(2.0, -1.0), Point2::new(2.0, 1.0), 40, 1e-4, Point2::origin())
-    }
-
-    #[test]
-    fn the_motion_s_jacobian_is_the_finite_difference() {
-        let mut robot = Robot::new(SlamConfig::default());
-        let (estimator, around) = robot.with(&[]);
-        let increment = Increment::from_motion(pose(0.3, 0.05, 0.4));
-        for from in [Vector3::new(1.0, -2.0, 0.7), Vector3::new(-3.0, 0.5, 3.1)] {
-            let at = |off: Vector3<f32>| {
-                let c = from + off;
-                estimator.moved(&pose(c.x, c.y, c.z), &increment, &around)
-            };
-            let by_pose = at(Vector3::zeros()).by_pose;
-            let h = 1e-2;
-            for k in 0..3 {
-                let step = Vector3::ith(k, h);
-                let slope = difference(&at(step).pose, &at(-step).pose) / (2.0 * h);
-                assert!((slope - by_pose.column(k)).norm() < 1e-3, "{k}: {slope} {by_pose}");
-            }
-        }
-    }
-
-    /// Over the way between keyframes. The Jacobian takes a turn as spread over the way, which is off by a twelfth of its square.
-    #[test]
-    fn the_motion_s_jacobian_by_the_odometry_s_errors_is_the_finite_difference() {
-        let mut robot = Robot::new(SlamConfig::default());
-        let (estimator, around) = robot.with(&[]);
-        let motions = [(0.15, 0.0), (-0.15, 0.1), (0.1, -0.15), (0.0, 0.2), (0.15, 0.15)];
-        for (forward, turn) in motions {
-            let increment = Increment::from_motion(exp(&Vector3::new(forward, 0.0, turn)));
-            for heading in [0.0, 0.7, -2.0, 3.1] {
-                let from = pose(1.0, -0.5, heading);
-                let jacobian = by_odometry(&from, &increment);
-                let h = 0.05;
-                for k in 0..3 {
-                    let mut at = |error: f32| {
-                        let bias = OdometryBias(Vector3::ith(k, error));
-                        estimator.filter.as_mut().unwrap().set_bias(bias);
-                        estimator.moved(&from, &increment, &around).pose
-                    };
-                    let slope = difference(&at(h), &at(-h)) / (2.0 * h);
-                    let off = slope - jacobian.column(k);
-                    assert!(off.norm() < 3e-4, "{k} of {forward} {turn}: {slope} {jacobian}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn a_motion_that_is_no_number_leaves_the_robot_unsure_where_it_was() {
-        for config in [SlamConfig::default(), SlamConfig::paper()] {
-            let mut robot = Robot::new(config);
-            assert!(robot.go(0.3, 0.0, 0.1));
-            let before = robot.estimator.pose();
-            assert!(!robot.go(f32::NAN, 0.0, 0.0));
-            assert_eq!(components(&robot.estimator.pose()), components(&before));
-            assert_eq!(robot.estimator.local().covariance, Matrix3::identity());
-            let covariance = robot.estimator.covariance(&config.line_noise);
-            assert!(covariance.m11 >= 1.0 && covariance.m33 >= 0.25, "{covariance}");
-            assert!(robot.go(0.1, 0.0, 0.0));
-        }
-    }
-
-    #[test]
-    fn pose_and_lines_move_at_once_and_only_once() {
-        let mut robot = Robot::new(SlamConfig::default());
-        assert_eq!(robot.see(&[wall()]).new, 1);
-        let at_first = robot.map.segments()[0].segment;
-        // Two decimetres by the odometry, and a centimetre more by the wall.
-        assert!(robot.go(0.1, 0.0, 0.0) && robot.go(0.1, 0.0, 0.0));
-        robot.tracker.pairs.push(crate::tracking::association::Pair { observed: 0, mapped: 0 }).unwrap();
-        let seen = wall().transformed(&pose(-0.21, 0.0, 0.0));
-        assert_eq!(robot.see(&[seen]).matched, 1);
-        assert_eq!(robot.map.segments()[0].segment.midpoint(), at_first.midpoint(), "not yet");
-        let before = robot.estimator.pose();
-        let (estimator, mut around) = robot.with(&[]);
-        estimator.commit(&mut around);
-        let after = robot.estimator.pose();
-        let gone_on = (before.inverse() * after).translation.vector.x;
-        let pushed = (robot.map.segments()[0].segment.midpoint() - at_first.midpoint()).x;
-        assert!(gone_on > 0.0 && pushed < 0.0, "both give way: {gone_on} {pushed}");
-        let (estimator, mut around) = robot.with(&[]);
-        estimator.commit(&mut around);
-        assert_eq!(components(&robot.estimator.pose()), components(&after));
-    }
-
-    #[test]
-    fn what_is_local_moves_as_one_and_old_lines_stay_with_their_places() {
-        let mut robot = Robot::new(SlamConfig::default());
-        robot.see(&[wall()]);
-        (0..20).for_each(|_| assert!(robot.go(1.0, 0.0, 0.0)));
-        robot.see(&[wall()]);
-        let (estimator, mut around) = robot.with(&[]);
-        estimator.commit(&mut around);
-        let seen = |robot: &Robot| {
-            let base_from_map = robot.estimator.pose().inverse();
-            base_from_map * robot.map.segments()[1].segment.midpoint()
-        };
-        let (old, new) = (robot.map.segments()[0].segment, seen(&robot));
-        let before = (robot.estimator.pose(), robot.estimator.local().covariance.determinant());
-        let moved = pose(0.5, -0.3, 0.2);
-        let (estimator, mut around) = robot.with(&[]);
-        estimator.carry(&moved, &Places::<96>::new(), &mut around);
-        assert_eq!(robot.map.segments()[0].segment.midpoint(), old.midpoint(), "no place has moved");
-        assert!((seen(&robot) - new).norm() < 1e-5);
-        assert!(
-            (robot.estimator.pose().translation.vector - (moved * before.0).translation.vector).norm() < 1e-5
-        );
-        let determinant = robot.estimator.local().covariance.determinant();
-        assert!((determinant - before.1).abs() <= 1e-2 * before.1, "{determinant} {}", before.1);
-    }
-
-    #[test]
-    fn size_is_what_the_documentation_says() {
-        assert!(core::mem::size_of::<Estimator>() <= 24 * 1024, "{}", core::mem::size_of::<Estimator>());
-    }
-}
+mod tests;

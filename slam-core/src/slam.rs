@@ -75,16 +75,6 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         update
     }
 
-    /// Moves the robot by odometry alone, where no scan has come.
-    pub fn coast(&mut self, motion: &Increment) -> Isometry2<f32> {
-        let (estimator, mut around) = self.estimator();
-        let is_usable = estimator.coast(motion, &mut around);
-        self.counters.count_motion(is_usable);
-        self.counters.coasted = self.counters.coasted.saturating_add(1);
-        self.places.pass_blindly(motion);
-        self.estimator.pose()
-    }
-
     /// The estimator, and what it works with.
     fn estimator(&mut self) -> (&mut Estimator, Surroundings<'_, N>) {
         let Self { config, odometry, frontend, map, tracker, estimator, .. } = self;
@@ -103,7 +93,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         self.counters.count_motion(is_usable);
         if self.estimator.is_way_long() {
             // Between the commit of one keyframe's update and the next keyframe.
-            self.open_lines(None);
+            let Self { config, estimator, tracker, map, .. } = self;
+            estimator.open_lines(config, tracker.nearby.all(), None, map);
         }
         self.estimator.local()
     }
@@ -186,37 +177,29 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     fn forget(&mut self, scan: &Scan<'_>, update: &SlamUpdate) {
         // What is seen from a wrong pose, and the way there, says nothing of the map.
         let is_sure = update.corrected && update.state != TrackingState::Lost;
-        let Some(config) = self.config.forgetting.filter(|_| is_sure) else {
-            self.estimator.restart_way();
+        let Self { config, estimator, tracker, map, .. } = self;
+        let Some(forgetting) = config.forgetting.as_ref().filter(|_| is_sure) else {
+            estimator.restart_way();
             return;
         };
-        let Self { config: SlamConfig { sensor, .. }, estimator, tracker, map, .. } = self;
-        let (sensor, pose, stamp) = (*sensor, estimator.pose(), estimator.stamp());
+        let (pose, stamp) = (estimator.pose(), estimator.stamp());
         // As the registration left them: fusing may have moved segments.
         let nearby = tracker.nearby.all();
-        let view = View::new(scan, &pose, &sensor, &config);
+        let view = View::new(scan, &pose, &config.sensor, forgetting);
         if update.registration.keyframe {
             mark_seen_through(&view, stamp.scan, nearby, map);
         }
         // A scan that searches has enough to do.
-        self.open_lines(Some(&view).filter(|_| update.registration.committed && !update.searched));
+        let view = Some(&view).filter(|_| update.registration.committed && !update.searched);
+        estimator.open_lines(config, nearby, view, map);
         if !update.registration.keyframe {
             return;
         }
-        let Self { estimator, map, .. } = self;
-        while let Some(index) = map.segments().iter().position(|s| is_gone(s, &config)) {
+        while let Some(index) = map.segments().iter().position(|s| is_gone(s, forgetting)) {
             estimator.forget_line(index, map);
         }
-        if let Some(walls) = &self.config.walls {
+        if let Some(walls) = &config.walls {
             estimator.tidy(walls, map);
-        }
-    }
-
-    /// Opens what the robot, and beams where there is a view, went through in part.
-    fn open_lines(&mut self, view: Option<&View<'_, '_>>) {
-        let Self { config: SlamConfig { openings, line_noise, .. }, estimator, tracker, map, .. } = self;
-        if let Some(openings) = openings {
-            estimator.open_lines(openings, line_noise, tracker.nearby.all(), view, map);
         }
     }
 

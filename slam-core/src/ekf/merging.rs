@@ -115,8 +115,8 @@ impl Relation {
             return None;
         }
         // The shorter one is judged by the longer one's line.
-        let (long, short) = if a.length_m() >= b.length_m() { (a, b) } else { (b, a) };
-        let distance = distance_m(long, short);
+        let [long, short] = Segment::longer_first(a, b);
+        let distance = long.farther_end_m(short);
         if distance > config.merge_max_distance_m {
             return None;
         }
@@ -136,10 +136,4 @@ impl Relation {
             () => Some(Self::OnePiece),
         }
     }
-}
-
-/// Distance of the farther end of `short` from the line of `long`, metres.
-fn distance_m(long: &Segment, short: &Segment) -> f32 {
-    let line = long.line();
-    max(line.signed_distance(short.start).abs(), line.signed_distance(short.end).abs())
 }

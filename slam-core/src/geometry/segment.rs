@@ -251,6 +251,23 @@ impl Segment {
         self.direction.dot(&(point - self.moments.centroid))
     }
 
+    /// The point of the segment that is nearest to another point.
+    pub fn nearest_to(&self, point: Point2<f32>) -> Point2<f32> {
+        let (from, to) = (self.along_of(self.start), self.along_of(self.end));
+        self.moments.centroid + self.direction * max(min(self.along_of(point), to), from)
+    }
+
+    /// Two segments, the longer one first.
+    pub fn longer_first<'a>(a: &'a Self, b: &'a Self) -> [&'a Self; 2] {
+        if a.length_m() >= b.length_m() { [a, b] } else { [b, a] }
+    }
+
+    /// Distance of the farther end of `other` from this segment's line, metres.
+    pub fn farther_end_m(&self, other: &Self) -> f32 {
+        let line = self.line();
+        max(line.signed_distance(other.start).abs(), line.signed_distance(other.end).abs())
+    }
+
     /// Length over which `other`, projected on this segment, lies within it, metres; negative: the gap between them.
     pub fn overlap_m(&self, other: &Self) -> f32 {
         -self.gap_to_m([other.start, other.end])

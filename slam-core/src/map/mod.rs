@@ -3,6 +3,8 @@
 //! When it is full, the segment that is worth least gives way to the new one: scans that saw it, fewer the longer the way since.
 //! Segments of the scan at hand never do. Each eviction and each segment refused is counted.
 
+#[cfg(test)]
+pub(crate) mod fixtures;
 pub mod nearby;
 pub mod openings;
 pub mod visibility;
@@ -20,7 +22,7 @@ pub struct MapSegment {
     /// The segment in `map`. Its weight and scatter say how sure its line is; while it is tracked with the pose, how sure it
     /// would be if the pose were known.
     pub segment: Segment,
-    /// Number of scans that saw it; stays at its maximum.
+    /// Number of scans that saw it, with the filter of keyframes; stays at its maximum.
     pub hits: u16,
     /// Scans whose beams went through it since it was last seen.
     pub seen_through: u16,
@@ -108,17 +110,19 @@ impl<const N: usize> SegmentMap<N> {
     /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns its index, if it
     /// found a place. Work: `N` steps when full.
     pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> Option<usize> {
-        self.insert_entry(MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m }, seen)
+        let entry = MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m };
+        self.insert_entry(entry, seen, None)
     }
 
-    /// The same for one that may have been seen before; `now` is the scan at hand.
-    pub(crate) fn insert_entry(&mut self, entry: MapSegment, now: u32) -> Option<usize> {
+    /// The same for one that may have been seen before; `now` is the scan at hand, and `spared` does not give way to it.
+    fn insert_entry(&mut self, entry: MapSegment, now: u32, spared: Option<usize>) -> Option<usize> {
         let way_m = entry.seen_at_m;
         if self.segments.push(entry).is_ok() {
             self.counters.added = self.counters.added.saturating_add(1);
             return Some(self.segments.len() - 1);
         }
-        let stale = self.segments.iter_mut().enumerate().filter(|(_, s)| s.last_seen != now);
+        let may_go = |(index, s): &(usize, &mut MapSegment)| s.last_seen != now && Some(*index) != spared;
+        let stale = self.segments.iter_mut().enumerate().filter(may_go);
         let Some((index, least)) = stale.min_by(|(_, a), (_, b)| a.worth(way_m).total_cmp(&b.worth(way_m)))
         else {
             self.counters.refused = self.counters.refused.saturating_add(1);
@@ -163,14 +167,8 @@ impl<const N: usize> SegmentMap<N> {
         };
         entry.segment = kept;
         self.counters.opened = self.counters.opened.saturating_add(1);
-        let whole = *entry;
-        // It must not give way to its own part.
-        entry.last_seen = now;
-        let part = other.and_then(|segment| self.insert_entry(MapSegment { segment, ..whole }, now));
-        if let Some(entry) = self.segments.get_mut(index) {
-            entry.last_seen = whole.last_seen;
-        }
-        part
+        let part = MapSegment { segment: other?, ..*entry };
+        self.insert_entry(part, now, Some(index))
     }
 
     /// Forgets the segments that are not finite.
@@ -244,5 +242,21 @@ mod tests {
         map.fuse(0, 0);
         map.fuse(0, 9);
         assert_eq!(map.segments().len(), 2, "itself and nobody are not fused");
+    }
+
+    #[test]
+    fn a_part_that_is_cut_off_does_not_take_the_room_of_the_rest() {
+        let mut map = SegmentMap::<2>::new();
+        let wall = |x: f32, length: f32, hits| fixtures::line((x, 0.0), (x, length), hits);
+        for entry in [wall(0.0, 5.0, 3), wall(9.0, 5.0, 50)] {
+            assert!(map.insert_entry(entry, 1, None).is_some());
+        }
+        let parts = [wall(0.0, 3.0, 1), wall(0.0, 1.0, 1)].map(|part| Some(part.segment));
+        assert_eq!(map.cut(0, parts, 7), Some(1));
+        assert_eq!(
+            map.segments().iter().map(|s| s.segment.length_m()).collect::<std::vec::Vec<_>>(),
+            [3.0, 1.0]
+        );
+        assert_eq!(map.segments()[1].hits, 3, "a part is as old as the whole");
     }
 }

@@ -38,7 +38,7 @@ pub(crate) struct ScanEvidence<'a> {
     pub observability: &'a Observability,
     /// Root mean square distance of the observed segments from their map lines, metres.
     pub residual_m: f32,
-    /// Whether the scan overruled the odometry, or the map was moved under the robot.
+    /// Whether the scan overruled the odometry.
     pub jumped: bool,
     /// Systematic errors of the odometry.
     pub bias: &'a OdometryBias,

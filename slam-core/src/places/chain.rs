@@ -106,7 +106,7 @@ impl Support {
 }
 
 /// Up to `P` anchors, in the order in which the robot came to them.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Chain<const P: usize> {
     pub(super) anchors: Vec<Anchor, P>,
 }
@@ -133,9 +133,9 @@ impl<const P: usize> Chain<P> {
         self.anchors.push(Anchor { pose, from_previous, variances, way_m, lines }).is_ok()
     }
 
-    /// The anchor that tells least, of those in the inside of the chain that are not `needed`: the one between the two that lie closest
+    /// The least informative anchor of those in the inside of the chain that are not `needed`: the one between the two that lie closest
     /// together along the way, or half as far where another place lies close by.
-    pub(super) fn least_telling(&self, needed: impl Fn(usize) -> bool) -> Option<usize> {
+    pub(super) fn least_informative(&self, needed: impl Fn(usize) -> bool) -> Option<usize> {
         let inside = 1..self.anchors.len().saturating_sub(2);
         let cost = |index: usize| {
             let (before, own, after) =
@@ -178,12 +178,12 @@ impl<const P: usize> Chain<P> {
     }
 
     /// Prefix sum of the variances of the edges up to an anchor, about the origin.
-    pub(super) fn spread_until(&self, index: usize) -> Matrix3<f64> {
-        self.spreads_until([index, index])[1]
+    pub(super) fn prefix_sum(&self, index: usize) -> Matrix3<f64> {
+        self.prefix_sums([index, index])[1]
     }
 
     /// The same up to two anchors, the earlier one first, in one pass.
-    pub(super) fn spreads_until(&self, [first, second]: [usize; 2]) -> [Matrix3<f64>; 2] {
+    pub(super) fn prefix_sums(&self, [first, second]: [usize; 2]) -> [Matrix3<f64>; 2] {
         let edges = |from: usize, to: usize| self.anchors.iter().take(to + 1).skip(from.saturating_add(1));
         let sum = |start, from, to| {
             edges(from, to).fold(start, |sum, anchor: &Anchor| sum + anchor.spread(&anchor.pose))
@@ -236,17 +236,17 @@ mod tests {
                 variances
             ));
         }
-        let (sum, last) = (chain.spread_until(4), chain.anchors[4].pose);
+        let (sum, last) = (chain.prefix_sum(4), chain.anchors[4].pose);
         let way = |chain: &Chain<8>| {
             chain.anchors[1..].iter().fold(chain.anchors[0].pose, |p, a| p * a.from_previous)
         };
         chain.remove(2);
         assert_eq!(chain.anchors.len(), 4);
         assert!((components(&way(&chain)) - components(&last)).norm() < 1e-4);
-        let after = chain.spread_until(3);
+        let after = chain.prefix_sum(3);
         let apart = (after - sum).amax() / sum.amax();
         assert!(apart < 0.2, "{apart}: {after} {sum}");
-        assert_eq!(chain.least_telling(|_| false), Some(1), "ways of 12 m against 16 m");
-        assert_eq!(chain.least_telling(|_| true), None);
+        assert_eq!(chain.least_informative(|_| false), Some(1), "ways of 12 m against 16 m");
+        assert_eq!(chain.least_informative(|_| true), None);
     }
 }

@@ -10,7 +10,7 @@ use nalgebra::{Isometry2, Matrix3};
 
 use super::PlacesConfig;
 use super::chain::{Anchor, Chain, diagonal};
-use super::factor::{LOOPS, ROWS};
+use super::factor::{LOOPS, ROWS, set_three};
 use super::lines::unpacked;
 use super::matching::{Gate, Match, matched};
 use super::solver::{Loop, Solver};
@@ -40,7 +40,7 @@ const FLOOR: [f32; 3] = [0.02, 0.02, 0.005];
 /// A match that waits, or is to be believed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Found {
-    pub tie: Loop,
+    pub edge: Loop,
     share: f32,
     taken: bool,
 }
@@ -64,7 +64,7 @@ struct Candidate {
 }
 
 /// The search. RAM: 2.5 KiB.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct Finder {
     query: Option<Query>,
     candidates: Vec<Candidate, CANDIDATES>,
@@ -102,7 +102,7 @@ impl<const P: usize> Known<'_, P> {
             let block =
                 inverse_adjoint(&at.pose).map(|v| v as f32) * end.minus(begin).map(|v| v as f32) * to_own;
             for (c, column) in columns.iter_mut().enumerate() {
-                super::factor::set_three(column, index, &block.column(c).into_owned());
+                set_three(column, index, &block.column(c).into_owned());
             }
         }
         columns.iter_mut().for_each(|column| factor.forward(column));
@@ -137,18 +137,18 @@ impl<const P: usize> Known<'_, P> {
     }
 
     /// Whether the chain has nothing against a loop, and how much it learns from it, nats. Work: one pass over the chain in `f64`.
-    fn gain(&self, tie: &Loop) -> Option<f32> {
+    fn gain(&self, edge: &Loop) -> Option<f32> {
         let [before, until] =
-            self.chain.spreads_until([tie.from, tie.to].map(usize::from)).map(|s| Packed::of(&s));
-        let innovation = self.covariance(tie.from, &before, tie.to, &until) + tie.covariance;
-        let off = components(&self.pose(tie.from).inv_mul(&self.pose(tie.to)).inv_mul(&tie.measured));
+            self.chain.prefix_sums([edge.from, edge.to].map(usize::from)).map(|s| Packed::of(&s));
+        let innovation = self.covariance(edge.from, &before, edge.to, &until) + edge.covariance;
+        let off = components(&self.pose(edge.from).inv_mul(&self.pose(edge.to)).inv_mul(&edge.measured));
         let chi2 = off.dot(&(innovation.try_inverse()? * off));
         (chi2 <= self.config.max_chi2)
-            .then(|| 0.5 * libm::logf(innovation.determinant() / tie.covariance.determinant()))
+            .then(|| 0.5 * libm::logf(innovation.determinant() / edge.covariance.determinant()))
     }
 
-    /// The loop that tells least, and how much, nats. Work: 3 solutions for each loop.
-    fn least_telling(&self) -> Option<(usize, f32)> {
+    /// The least informative loop, and how much it tells, nats. Work: 3 solutions for each loop.
+    fn least_informative(&self) -> Option<(usize, f32)> {
         let (factor, _) = self.solver.posterior();
         let gain = |(index, l): (usize, &Loop)| {
             let given = factor.inverse_block(index).determinant() * l.covariance.determinant();
@@ -168,8 +168,8 @@ impl Finder {
     pub fn begin<const P: usize>(&mut self, place: u16, chain: &Chain<P>) {
         self.candidates.clear();
         self.found.clear();
-        self.pending.retain(|p| place.saturating_sub(p.tie.to) <= WAIT);
-        let spread = Packed::of(&chain.spread_until(place.into()));
+        self.pending.retain(|p| place.saturating_sub(p.edge.to) <= WAIT);
+        let spread = Packed::of(&chain.prefix_sum(place.into()));
         self.query = Some(Query { place, spread, next: Some((0, Packed::ZERO)) });
     }
 
@@ -187,7 +187,7 @@ impl Finder {
 
     /// Whether an anchor is needed.
     pub fn needs(&self, index: usize) -> bool {
-        let is_end = |f: &Found| usize::from(f.tie.from) == index || usize::from(f.tie.to) == index;
+        let is_end = |f: &Found| usize::from(f.edge.from) == index || usize::from(f.edge.to) == index;
         self.pending.iter().chain(&self.found).any(is_end)
             || self.query.is_some_and(|q| usize::from(q.place) == index)
     }
@@ -195,7 +195,7 @@ impl Finder {
     /// An anchor is gone, and those after it have moved up. The place on its way is given up.
     pub fn removed(&mut self, index: u16) {
         for found in &mut self.pending {
-            found.tie.removed(index);
+            found.edge.removed(index);
         }
         self.query = None;
         self.candidates.clear();
@@ -222,14 +222,16 @@ impl Finder {
     /// Which of the next places the new one may be.
     fn sieve<const P: usize>(&mut self, query: &mut Query, known: &Known<'_, P>) {
         let Some((first, spread)) = query.next.take() else { return };
+        let after = first.saturating_add(SIEVED as u16);
+        let mut is_last = after >= query.place;
         let (own, own_way_m) = (known.pose(query.place), known.way_m(query.place));
         let mut sum = spread.matrix();
         for place in (first..query.place).take(SIEVED) {
             let Some(anchor) = known.chain.get(place.into()) else { return };
             if own_way_m - anchor.way_m < known.config.min_way_m {
                 // Those that follow are younger still.
-                self.candidates.sort_unstable_by(|a, b| b.rank.total_cmp(&a.rank));
-                return;
+                is_last = true;
+                break;
             }
             if place > 0 {
                 sum += anchor.spread(&anchor.pose);
@@ -249,25 +251,25 @@ impl Finder {
             }
             let _ = self.candidates.push(Candidate { place, spread, rank });
         }
-        query.next = Some((first.saturating_add(SIEVED as u16), Packed::of(&sum)));
-        if first.saturating_add(SIEVED as u16) >= query.place {
-            query.next = None;
+        if is_last {
             self.candidates.sort_unstable_by(|a, b| b.rank.total_cmp(&a.rank));
+        } else {
+            query.next = Some((after, Packed::of(&sum)));
         }
     }
 
     /// Which matches of the place that is through are to be believed, with those they confirm.
     ///
-    /// Work: [`AT_ONCE`] loops judged, and where there is no more room, the one that tells least looked for.
+    /// Work: [`AT_ONCE`] loops judged, and where there is no more room, the least informative one looked for.
     fn decide<const P: usize>(&mut self, known: &Known<'_, P>) -> (Vec<Loop, AT_ONCE>, Option<usize>) {
         let confirmed = |m: &Found| {
             known.config.confirmations == 0
-                || self.pending.iter().any(|p| p.tie.to < m.tie.to && known.agree(&m.tie, &p.tie))
+                || self.pending.iter().any(|p| p.edge.to < m.edge.to && known.agree(&m.edge, &p.edge))
         };
         let new: Vec<Found, CANDIDATES> = self.found.iter().copied().filter(|m| confirmed(m)).collect();
         let mut taken: Vec<Loop, AT_ONCE> = Vec::new();
         let mut gives_way = None;
-        let agrees = |p: &Found| new.iter().any(|m| m.tie.to > p.tie.to && known.agree(&m.tie, &p.tie));
+        let agrees = |p: &Found| new.iter().any(|m| m.edge.to > p.edge.to && known.agree(&m.edge, &p.edge));
         for found in &self.found {
             if self.pending.is_full() {
                 self.pending.remove(0);
@@ -278,10 +280,10 @@ impl Finder {
         let share = |k: &u8| self.pending.get(usize::from(*k)).map_or(0.0, |p| p.share);
         order.sort_unstable_by(|a, b| share(b).total_cmp(&share(a)));
         let mut judged = 0;
-        let mut least_telling = None;
+        let mut least_informative = None;
         for k in order {
             let Some(found) = self.pending.get_mut(usize::from(k)) else { continue };
-            let is_new = new.iter().any(|m| m.tie.to == found.tie.to && m.tie.from == found.tie.from);
+            let is_new = new.iter().any(|m| m.edge.to == found.edge.to && m.edge.from == found.edge.from);
             if found.taken || !(is_new || agrees(found)) {
                 continue;
             }
@@ -289,7 +291,7 @@ impl Finder {
                 break;
             }
             judged += 1;
-            let Some(gain) = known.gain(&found.tie).filter(|gain| *gain >= known.config.min_gain) else {
+            let Some(gain) = known.gain(&found.edge).filter(|gain| *gain >= known.config.min_gain) else {
                 continue;
             };
             if known.loops.len() + taken.len() >= LOOPS {
@@ -297,15 +299,15 @@ impl Finder {
                 if !taken.is_empty() {
                     break;
                 }
-                least_telling = least_telling.or_else(|| known.least_telling());
-                let Some((index, least)) = least_telling else { break };
+                least_informative = least_informative.or_else(|| known.least_informative());
+                let Some((index, least)) = least_informative else { break };
                 if least >= gain {
                     continue;
                 }
                 gives_way = Some(index);
             }
             found.taken = true;
-            let _ = taken.push(found.tie);
+            let _ = taken.push(found.edge);
             if gives_way.is_some() {
                 break;
             }
@@ -328,13 +330,13 @@ fn compare<const P: usize>(query: &Query, candidate: &Candidate, known: &Known<'
     let is_seen = found.share >= known.config.min_share
         && found.runner_up <= known.config.max_runner_up * found.share
         && found.weakest() >= known.config.min_information;
-    let tie = Loop {
+    let edge = Loop {
         from: candidate.place,
         to: query.place,
         measured: found.pose,
         covariance: covariance_of(&found)?,
     };
-    is_seen.then_some(Found { tie, share: found.share, taken: false })
+    is_seen.then_some(Found { edge, share: found.share, taken: false })
 }
 
 /// Covariance of a match in its own frame.

@@ -146,16 +146,10 @@ pub(super) fn chosen(
 /// Whether a line may be one of a place.
 fn is_of(entry: &MapSegment, anchor: &Isometry2<f32>) -> bool {
     let segment = &entry.segment;
-    let along = within_line(segment, anchor.translation.vector.into());
-    let nearest = segment.moments.centroid + segment.direction * along;
+    let nearest = segment.nearest_to(anchor.translation.vector.into());
     entry.hits >= LEAST_HITS
         && segment.length_m() >= LEAST_LENGTH_M
         && (nearest.coords - anchor.translation.vector).norm_squared() < REACH_M * REACH_M
-}
-
-fn within_line(segment: &Segment, point: Point2<f32>) -> f32 {
-    let (from, to) = (segment.along_of(segment.start), segment.along_of(segment.end));
-    max(min(segment.along_of(point), to), from)
 }
 
 /// The ends of a line in a place's frame, none farther along it from the place's foot than [`REACH_M`].
@@ -171,22 +165,16 @@ fn clipped(segment: &Segment) -> Option<[Point2<f32>; 2]> {
 mod tests {
     use super::*;
     use crate::geometry::pose::pose;
-
-    fn entry(from: (f32, f32), to: (f32, f32), hits: u16) -> MapSegment {
-        let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
-        let segment =
-            Segment::from_ends(from, to, 9, 1e-4, nalgebra::center(&from, &to) + perpendicular(to - from));
-        MapSegment { segment, hits, seen_through: 0, last_seen: 1, seen_at_m: 0.0 }
-    }
+    use crate::map::fixtures::line;
 
     #[test]
     fn directions_are_spread_and_short_or_doubtful_lines_stay_out() {
         let mut map: std::vec::Vec<_> =
-            (0..20).map(|k| entry((0.0, 0.2 * k as f32), (4.0, 0.2 * k as f32), 9)).collect();
-        map.push(entry((1.0, 0.0), (1.0, 1.0), 9));
-        map.push(entry((2.0, 0.0), (2.0, 0.3), 9));
-        map.push(entry((3.0, 0.0), (3.0, 2.0), 1));
-        map.push(entry((40.0, 0.0), (40.0, 2.0), 9));
+            (0..20).map(|k| line((0.0, 0.2 * k as f32), (4.0, 0.2 * k as f32), 9)).collect();
+        map.push(line((1.0, 0.0), (1.0, 1.0), 9));
+        map.push(line((2.0, 0.0), (2.0, 0.3), 9));
+        map.push(line((3.0, 0.0), (3.0, 2.0), 1));
+        map.push(line((40.0, 0.0), (40.0, 2.0), 9));
         let lines = chosen(&map, &pose(1.0, 0.5, 0.3), |_| true, |_| true);
         assert_eq!(lines.len(), PLACE_LINES);
         let across = unpacked(&lines)
@@ -200,7 +188,7 @@ mod tests {
     #[test]
     fn a_line_comes_back_to_a_millimetre() {
         let anchor = pose(100.0, -50.0, 2.0);
-        let map = [entry((101.0, -49.0), (99.0, -46.5), 5)];
+        let map = [line((101.0, -49.0), (99.0, -46.5), 5)];
         let lines = chosen(&map, &anchor, |_| true, |_| true);
         let [start, end] = lines[0].ends();
         assert!((anchor * start - map[0].segment.start).norm() < 1e-3);
@@ -209,7 +197,7 @@ mod tests {
 
     #[test]
     fn a_long_wall_is_cut_and_one_beyond_the_numbers_left_out() {
-        let map = [entry((-80.0, 1.0), (90.0, 1.0), 5)];
+        let map = [line((-80.0, 1.0), (90.0, 1.0), 5)];
         let lines = chosen(&map, &pose(0.0, 0.0, 0.0), |_| true, |_| true);
         assert!((unpacked(&lines)[0].length_m - 2.0 * REACH_M).abs() < 1e-2);
         assert_eq!(PlaceLine::of(Point2::new(33.0, 0.0), Point2::origin()), None);

@@ -266,17 +266,13 @@ fn refined(query: &[Ray], place: &[Ray], start: Isometry2<f32>) -> Match {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::pose::perpendicular;
-    use crate::geometry::segment::Segment;
     use crate::map::MapSegment;
+    use crate::map::fixtures::line;
     use crate::places::chain::diagonal;
     use crate::places::lines::{chosen, unpacked};
 
     fn wall(from: (f32, f32), to: (f32, f32)) -> MapSegment {
-        let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
-        let free = nalgebra::center(&from, &to) + perpendicular(to - from);
-        let segment = Segment::from_ends(from, to, 9, 1e-4, free);
-        MapSegment { segment, hits: 9, seen_through: 0, last_seen: 1, seen_at_m: 0.0 }
+        line(from, to, 9)
     }
 
     /// A room with a recess, a pillar and a table that stands askew.

@@ -24,8 +24,6 @@ use nalgebra::{Isometry2, Point2};
 
 use crate::config::{Checked, not_negative};
 use crate::geometry::math::within;
-#[cfg(test)]
-use crate::geometry::pose::components;
 use crate::geometry::pose::{heading, normalized, pose, turn};
 use crate::map::MapSegment;
 use crate::map::walls::WallConfig;
@@ -228,7 +226,7 @@ impl<const P: usize> Places<P> {
         }
     }
 
-    /// Gives up the place that tells least.
+    /// Gives up the least informative place.
     fn make_room(&mut self) {
         if self.solver.is_busy() {
             self.solver.clear();
@@ -237,7 +235,7 @@ impl<const P: usize> Places<P> {
         let (loops, finder) = (&self.loops, &self.finder);
         let is_end =
             |index: usize| loops.iter().any(|l| usize::from(l.from) == index || usize::from(l.to) == index);
-        let Some(gone) = self.chain.least_telling(|index| is_end(index) || finder.needs(index)) else {
+        let Some(gone) = self.chain.least_informative(|index| is_end(index) || finder.needs(index)) else {
             // Next time there is one.
             self.finder.drop_pending();
             return;
@@ -250,8 +248,9 @@ impl<const P: usize> Places<P> {
     /// Steps for a scan after such a motion. A keyframe has enough to do and takes one of them, but not the only one twice in a row.
     pub(crate) fn steps(&mut self, motion: &Increment, is_keyframe: bool) -> u8 {
         let steps = (1.0 + within(motion.distance_m / STEP_M, 0.0, f32::from(MOST_STEPS - 1))) as u8;
-        self.rested = is_keyframe && steps == 1 && !self.rested;
-        if self.rested || (is_keyframe && steps > 1) { steps - 1 } else { steps }
+        let rests = is_keyframe && (steps > 1 || !self.rested);
+        self.rested = rests && steps == 1;
+        steps - u8::from(rests)
     }
 
     /// The robot moved where no scan was taken in.
@@ -282,8 +281,8 @@ impl<const P: usize> Places<P> {
             self.loops.remove(index);
         }
         self.is_stale = !found.is_empty();
-        for tie in found {
-            let _ = self.loops.push(tie);
+        for edge in found {
+            let _ = self.loops.push(edge);
         }
         None
     }
@@ -329,12 +328,6 @@ impl<const P: usize> Places<P> {
     /// The same of a pose that the robot had.
     pub fn moved_pose(&self, way_m: f32, old: &Isometry2<f32>) -> Isometry2<f32> {
         self.moved(way_m, &old.translation.vector.into()) * old
-    }
-
-    /// Whether every pose is a number.
-    #[cfg(test)]
-    fn is_whole(&self) -> bool {
-        self.chain.anchors().iter().all(|a| components(&a.pose).iter().all(|v| v.is_finite()))
     }
 }
 

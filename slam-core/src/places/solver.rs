@@ -21,6 +21,7 @@ use nalgebra::{Isometry2, Matrix3, Vector3};
 use super::chain::{Anchor, Chain};
 use super::factor::{Column, Factor, LOOPS, ROWS, set_three, three};
 use super::twist::{Packed, adjoint, inverse_adjoint, to_f32, to_f64};
+use crate::geometry::math::max;
 use crate::geometry::pose::{exp, is_finite, log, normalized};
 
 /// Rounds of a solution.
@@ -229,7 +230,7 @@ impl<const P: usize> Solver<P> {
                 }
             }
             let step = to_f32(&(inverse_adjoint(pose) * (sum - pass.deviation)));
-            largest = crate::geometry::math::max(largest, step.amax());
+            largest = max(largest, step.amax());
             *pose = normalized(&(*pose * exp(&step)));
             if !is_finite(pose) {
                 return Progress::Failed;

@@ -1,16 +1,12 @@
 //! Robots that drive, see what is around them, and drift.
 
 use super::*;
-use crate::geometry::pose::{exp, normalized, perpendicular};
+use crate::geometry::pose::{components, exp, normalized};
 use crate::geometry::segment::Segment;
+use crate::map::fixtures::line;
 use nalgebra::Vector3;
 
 const CONFIG: PlacesConfig = crate::config::PLACES;
-
-fn wall(from: (f32, f32), to: (f32, f32)) -> Segment {
-    let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
-    Segment::from_ends(from, to, 9, 1e-4, nalgebra::center(&from, &to) + perpendicular(to - from))
-}
 
 /// Things of many sizes and directions along both sides of a way round a block of `w` by `h` metres.
 fn building(w: f32, h: f32) -> std::vec::Vec<Segment> {
@@ -27,7 +23,7 @@ fn building(w: f32, h: f32) -> std::vec::Vec<Segment> {
         let from = at * Point2::new(random(), side);
         let (s, c) = (core::f32::consts::TAU * random()).sin_cos();
         let length = 0.5 + 1.5 * random();
-        walls.push(wall((from.x, from.y), (from.x + c * length, from.y + s * length)));
+        walls.push(line((from.x, from.y), (from.x + c * length, from.y + s * length), 9).segment);
     }
     walls
 }
@@ -135,7 +131,44 @@ fn more_way_than_there_is_room_for_thins_the_chain() {
     assert!(drive.worst_m() < 0.4, "{}", drive.worst_m());
     let ways = drive.places.anchors().windows(2).map(|two| two[1].way_m() - two[0].way_m());
     assert!(ways.fold(0.0, f32::max) < 40.0, "no hole in the chain");
-    assert!(drive.places.is_whole());
+    let is_finite = |anchor: &Anchor| components(&anchor.pose()).iter().all(|v| v.is_finite());
+    assert!(drive.places.anchors().iter().all(is_finite));
+}
+
+/// Variances of the edge between two places, with that motion between them where no scan was taken in.
+fn variances(unseen: Option<Increment>) -> [f32; 3] {
+    let mut places = std::boxed::Box::new(Places::<96>::new());
+    for way_m in [0.0, 4.0] {
+        let motion = Increment::from_motion(pose(way_m, 0.0, 0.0));
+        let pose = pose(way_m, 0.0, 0.0);
+        places.visit(
+            &Visit { pose, motion, way_m, verdict: Verdict::Full, support: 0.9, map: &[], walls: None },
+            &CONFIG,
+        );
+        unseen.iter().for_each(|motion| places.pass_blindly(motion));
+    }
+    places.chain.anchors[1].variances
+}
+
+#[test]
+fn way_that_no_scan_saw_makes_the_chain_unsure_and_no_number_does_not_spoil_it() {
+    let seen = variances(None);
+    for unseen in [pose(3.0, 0.0, 0.0), pose(f32::NAN, 0.0, 0.0)] {
+        let blind = variances(Some(Increment::from_motion(unseen)));
+        assert!((0..3).all(|k| blind[k] > 10.0 * seen[k] && blind[k] < 1.0), "{blind:?} {seen:?}");
+    }
+}
+
+#[test]
+fn a_keyframe_takes_a_step_but_not_the_only_one_twice_in_a_row() {
+    let mut places = std::boxed::Box::new(Places::<96>::new());
+    let [slow, fast] = [0.01, 0.3].map(|m| Increment::from_motion(pose(m, 0.0, 0.0)));
+    let mut steps =
+        |motion, keyframes: [bool; 4]| keyframes.map(|is_keyframe| places.steps(motion, is_keyframe));
+    assert_eq!(steps(&slow, [true; 4]), [0, 1, 0, 1]);
+    assert_eq!(steps(&slow, [false, true, false, true]), [1, 0, 1, 0]);
+    let [first, second, third, _] = steps(&fast, [false, true, true, true]);
+    assert!(first > 2 && second == first - 1 && third == second, "{first} {second} {third}");
 }
 
 #[test]

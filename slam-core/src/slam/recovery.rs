@@ -1,11 +1,22 @@
-//! Going on with a map after a reset, or after a motion that nobody saw.
+//! Going on where no scan has come, after a reset, or after a motion that nobody saw.
 
 use nalgebra::{Isometry2, Matrix3};
 
 use super::Slam;
 use crate::map::MapSegment;
+use crate::odometry::Increment;
 
 impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
+    /// Moves the robot by odometry alone, where no scan has come.
+    pub fn coast(&mut self, motion: &Increment) -> Isometry2<f32> {
+        let (estimator, mut around) = self.estimator();
+        let is_usable = estimator.coast(motion, &mut around);
+        self.counters.count_motion(is_usable);
+        self.counters.coasted = self.counters.coasted.saturating_add(1);
+        self.places.pass_blindly(motion);
+        self.estimator.pose()
+    }
+
     /// Takes up a map made before, with the robot at a pose in it that is taken as certain. Segments beyond the capacity are left out, and
     /// counted as refused.
     pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {

@@ -136,7 +136,7 @@ fn drifting<const P: usize>(
     chain
 }
 
-fn tie(truth: &[Isometry2<f32>], from: usize, to: usize) -> Loop {
+fn edge(truth: &[Isometry2<f32>], from: usize, to: usize) -> Loop {
     let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-5));
     Loop { from: from as u16, to: to as u16, measured: truth[from].inv_mul(&truth[to]), covariance }
 }
@@ -162,7 +162,7 @@ fn a_loop_of_150_m_closes() {
     let truth = block(0.0);
     // A degree in 25 m, and two per cent of the way.
     let mut chain = drifting::<64>(&truth, |_| Vector3::new(0.08, 0.01, 0.003));
-    let loops = [tie(&truth, 0, 38), tie(&truth, 1, 39)];
+    let loops = [edge(&truth, 0, 38), edge(&truth, 1, 39)];
     let gap = |chain: &Chain<64>| {
         let at = |k: usize| chain.anchors()[k].pose;
         (at(0).inv_mul(&at(38)).translation.vector - loops[0].measured.translation.vector).norm()
@@ -178,7 +178,7 @@ fn loops_that_share_nothing_do_not_disturb_each_other() {
     let mut seed = 5;
     let mut drift = |_| Vector3::new(noise(&mut seed), noise(&mut seed), noise(&mut seed)) * 0.02;
     let chain = drifting::<32>(&truth, &mut drift);
-    let (early, late) = (tie(&truth, 2, 9), tie(&truth, 15, 25));
+    let (early, late) = (edge(&truth, 2, 9), edge(&truth, 15, 25));
     let (mut one, mut both) = (chain.clone(), chain.clone());
     assert!(solved(&mut one, &[early]) && solved(&mut both, &[early, late]));
     for k in 0..=15 {
@@ -204,9 +204,9 @@ fn a_kilometre_from_the_origin_it_is_as_good() {
     let (near, far) = (block(0.0), block(1000.0));
     let drift = |_| Vector3::new(0.02, 0.01, 0.003);
     let (mut here, mut there) = (drifting::<64>(&near, drift), drifting::<64>(&far, drift));
-    let ties: [(usize, usize); 4] = [(0, 38), (1, 39), (2, 36), (12, 30)];
-    assert!(solved(&mut here, &ties.map(|(a, b)| tie(&near, a, b))));
-    assert!(solved(&mut there, &ties.map(|(a, b)| tie(&far, a, b))));
+    let edges: [(usize, usize); 4] = [(0, 38), (1, 39), (2, 36), (12, 30)];
+    assert!(solved(&mut here, &edges.map(|(a, b)| edge(&near, a, b))));
+    assert!(solved(&mut there, &edges.map(|(a, b)| edge(&far, a, b))));
     for (a, b) in here.anchors.iter().zip(&there.anchors) {
         let off = a.pose.translation.vector + nalgebra::Vector2::new(1000.0, 0.0) - b.pose.translation.vector;
         assert!(off.norm() < 0.01, "{off}");
@@ -220,7 +220,7 @@ fn full_to_the_brim_it_does_not_panic() {
     let mut seed = 1;
     let mut chain = drifting::<96>(&truth, |_| Vector3::new(noise(&mut seed), noise(&mut seed), 0.0) * 0.02);
     assert!(!chain.push(pose(0.0, 0.0, 0.0), 400.0, VARIANCES));
-    let loops: std::vec::Vec<_> = (0..LOOPS).map(|k| tie(&truth, k, 95 - 2 * k)).collect();
+    let loops: std::vec::Vec<_> = (0..LOOPS).map(|k| edge(&truth, k, 95 - 2 * k)).collect();
     assert!(solved(&mut chain, &loops));
     let bad = Loop { covariance: Matrix3::identity() * f32::NAN, ..loops[0] };
     assert!(!solved(&mut chain, &[bad]));
@@ -229,7 +229,7 @@ fn full_to_the_brim_it_does_not_panic() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     #[test]
-    fn it_finds_what_dense_gauss_newton_finds(seed in any::<u64>(), turn in -0.4f32..0.4, ties in 1usize..8) {
+    fn it_finds_what_dense_gauss_newton_finds(seed in any::<u64>(), turn in -0.4f32..0.4, edges in 1usize..8) {
         let mut seed = seed;
         let mut at = pose(20.0, -10.0, 1.0);
         let truth: std::vec::Vec<_> = (0..36)
@@ -241,9 +241,9 @@ proptest! {
         let drift = |_| Vector3::new(0.03 * noise(&mut seed), 0.03 * noise(&mut seed), 0.015 * noise(&mut seed));
         let mut chain = drifting::<40>(&truth, drift);
         let mut loops = std::vec::Vec::new();
-        for k in 0..ties {
+        for k in 0..edges {
             let from = (k * 5) % 20;
-            loops.push(tie(&truth, from, from + 6 + (k * 7) % 10));
+            loops.push(edge(&truth, from, from + 6 + (k * 7) % 10));
         }
         let exact = gauss_newton(&chain, &loops);
         prop_assert!(solved(&mut chain, &loops));
