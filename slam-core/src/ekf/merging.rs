@@ -50,8 +50,8 @@ pub(super) fn merge_walls<const N: usize>(
             continue;
         }
         let Some(twin) = related(Relation::OnePiece) else {
-            // That a new line goes on behind an opening is learnt once.
-            if changed.hits == 1
+            // That a line goes on behind an opening is learnt once, when it is no longer tentative: what is seen once may be a bridge.
+            if changed.hits == config.tentative_hits
                 && let Some(other) = related(Relation::OneWall)
                 && let Some(updated) = update_by_twins([other, index], sensor, config, pose, filter, map)
             {
