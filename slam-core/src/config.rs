@@ -22,6 +22,7 @@ use crate::paper::end_points::{EndPointWeight, EndPointsConfig};
 use crate::paper::least_squares::{LeastSquaresConfig, Singular};
 use crate::paper::ransac::RansacConfig;
 use crate::places::PlacesConfig;
+use crate::relocalisation::RelocalisationConfig;
 use crate::sensor::scan::{Mounting, RangeCodes, RangeNoise, ScanGeometry, SensorConfig};
 use crate::tracking::association::{AssociationConfig, GateConfig};
 use crate::tracking::correction::{CorrectionConfig, GaussNewtonConfig};
@@ -75,6 +76,8 @@ pub struct SlamConfig {
     pub correction: CorrectionConfig,
     /// How far the pose is to be relied on.
     pub state: StateConfig,
+    /// A robot that was displaced looks for itself in its map, or not.
+    pub relocalisation: Option<RelocalisationConfig>,
     /// Places, and loops between them closed, or not.
     pub places: Option<PlacesConfig>,
     /// What is seen through forgotten, or not.
@@ -117,6 +120,9 @@ const STATE: StateConfig = StateConfig {
     least_segments: 2,
     found_after: 3,
     contradicted_share: 0.5,
+    most_missing: 1.5,
+    standing_slack: 0.25,
+    standing_m: 0.1,
 };
 
 /// Prior: a host that stamps a scan as its last byte comes is late by half a sweep and the way there, some 50 ms. The limit is what the
@@ -238,11 +244,22 @@ impl Default for SlamConfig {
                     wild_chi2: 30.0,
                     suspicious_chi2: 6.0,
                     suspicious_scans: 2,
-                    found_score: 0.6,
-                    found_segments: 4.0,
                 },
             }),
             state: STATE,
+            relocalisation: Some(RelocalisationConfig {
+                places_per_scan: 1,
+                guesses_per_scan: 12,
+                least_segments: 3,
+                least_support: 0.45,
+                min_support: 0.6,
+                max_runner_up: 0.65,
+                min_odds: 5.0,
+                scans: 5,
+                apart_m: 0.07,
+                min_lead: 2.0,
+                give_up_m: 8.0,
+            }),
             places: Some(PLACES),
             forgetting: Some(ForgetConfig { margin_m: 0.2, margin_sigmas: 3.0, min_sine: 0.1, scans: 3 }),
             walls: Some(WallConfig {
@@ -323,6 +340,7 @@ impl SlamConfig {
                 singular: Singular::KeepPose,
             }),
             state: STATE,
+            relocalisation: None,
             places: None,
             forgetting: None,
             openings: None,
@@ -490,6 +508,12 @@ impl SlamConfig {
         not_negative("state.bad_score", self.state.bad_score)?;
         positive("state.lost_way_m", self.state.lost_way_m)?;
         positive("state.contradicted_share", self.state.contradicted_share)?;
+        not_negative("state.standing_slack", self.state.standing_slack)?;
+        not_negative("state.standing_m", self.state.standing_m)?;
+        positive("state.most_missing", self.state.most_missing)?;
+        if let Some(relocalisation) = &self.relocalisation {
+            relocalisation.validate()?;
+        }
         if let Some(places) = &self.places {
             places.validate()?;
         }
@@ -571,7 +595,7 @@ pub(crate) type Checked = Result<(), &'static str>;
 
 // Called seventy times and once in a lifetime: not inlined, they are 4 kB of flash less.
 #[inline(never)]
-fn check(field: &'static str, holds: bool) -> Checked {
+pub(crate) fn check(field: &'static str, holds: bool) -> Checked {
     if holds { Ok(()) } else { Err(field) }
 }
 

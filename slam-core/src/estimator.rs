@@ -161,14 +161,14 @@ impl Estimator {
     /// Eq. (1) with covariance: moves the pose by the odometry. False where a number is not finite: the robot is then taken to
     /// stand still, unsure by a metre and a radian.
     pub fn predict<const N: usize>(&mut self, motion: &ScanMotion, around: &mut Surroundings<'_, N>) -> bool {
-        let moved = self.moved(&self.map_from_base, &motion.since_previous, around);
-        let covariance = moved.by_pose * self.local_covariance * moved.by_pose.transpose() + moved.noise;
-        if !(motion.is_finite() && is_finite(&moved.pose) && covariance.iter().all(|v| v.is_finite())) {
+        let Prior { pose, covariance } =
+            self.predicted(&self.local(), &motion.since_previous, around.odometry, around.config);
+        if !(motion.is_finite() && is_finite(&pose) && covariance.iter().all(|v| v.is_finite())) {
             self.local_covariance = Matrix3::identity();
             self.inflate_filter(&Matrix3::identity(), around);
             return false;
         }
-        (self.map_from_base, self.local_covariance) = (moved.pose, covariance);
+        (self.map_from_base, self.local_covariance) = (pose, covariance);
         self.keyframe.since = self.keyframe.since.then(&motion.since_previous);
         self.keyframe.scans = self.keyframe.scans.saturating_add(1);
         self.travelled_m += motion.since_previous.distance_m;
@@ -176,6 +176,18 @@ impl Estimator {
             self.commit(around);
         }
         true
+    }
+
+    /// Where the odometry leads from a pose, with covariance.
+    pub fn predicted(
+        &self,
+        from: &Prior,
+        motion: &Increment,
+        odometry: &OdometryHealth,
+        config: &SlamConfig,
+    ) -> Prior {
+        let Moved { pose, by_pose, noise } = self.moved(&from.pose, motion, odometry, config);
+        Prior { pose, covariance: by_pose * from.covariance * by_pose.transpose() + noise }
     }
 
     /// Moves on by odometry alone, where no scan has come. False as in [`Self::predict`].
@@ -338,7 +350,7 @@ impl Estimator {
     /// Moves the filter's pose on by what the odometry said since the last keyframe. Returns it.
     fn advance<const N: usize>(&mut self, around: &mut Surroundings<'_, N>) -> Isometry2<f32> {
         let last = self.keyframe;
-        let moved = self.moved(&last.map_from_base, &last.since, around);
+        let moved = self.moved(&last.map_from_base, &last.since, around.odometry, around.config);
         if let Some(filter) = &mut self.filter {
             let by_odometry = by_odometry(&last.map_from_base, &last.since);
             filter.predict(&moved.by_pose, &by_odometry, &moved.noise, around.map);
@@ -350,18 +362,19 @@ impl Estimator {
     }
 
     /// Where an increment of the odometry leads from a pose.
-    fn moved<const N: usize>(
+    fn moved(
         &self,
         from: &Isometry2<f32>,
         increment: &Increment,
-        around: &Surroundings<'_, N>,
+        odometry: &OdometryHealth,
+        config: &SlamConfig,
     ) -> Moved {
         let increment = self.odometry_bias().corrected(increment);
         let pose = normalized(&(from * increment.before_from_after));
         let lever = perpendicular(from.rotation * increment.before_from_after.translation.vector);
         let mut by_pose = Matrix3::identity();
         (by_pose.m13, by_pose.m23) = (lever.x, lever.y);
-        let noise = around.odometry.covariance(&increment, &around.config.odometry);
+        let noise = odometry.covariance(&increment, &config.odometry);
         Moved { pose, by_pose, noise: rotate_covariance(from, &noise) }
     }
 

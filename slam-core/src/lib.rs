@@ -82,6 +82,7 @@ pub mod mapper;
 pub mod odometry;
 pub mod paper;
 pub mod places;
+pub mod relocalisation;
 pub mod sensor;
 pub mod slam;
 pub mod tracking;

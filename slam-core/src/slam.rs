@@ -2,6 +2,7 @@
 
 mod access;
 mod recovery;
+mod relocation;
 
 use nalgebra::Isometry2;
 
@@ -14,6 +15,7 @@ use crate::odometry::Increment;
 use crate::odometry::health::{OdometryHealth, ScanEvidence};
 use crate::odometry::track::ScanMotion;
 use crate::places::{Places, Visit};
+use crate::relocalisation::Relocaliser;
 use crate::sensor::scan::Scan;
 use crate::tracking::correction::Prior;
 use crate::tracking::state::StateMonitor;
@@ -33,6 +35,7 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682, const P: usize = 96> {
     places: Places<P>,
     odometry: OdometryHealth,
     state: StateMonitor,
+    relocaliser: Relocaliser,
     counters: Counters,
 }
 
@@ -62,7 +65,11 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         update.rejected = ScanRejection::of(scan, &self.config.sensor.geometry);
         if update.rejected.is_none() {
             self.observe(scan, motion, &mut update, watch);
-            self.track(&previous, &prior, &mut update, watch);
+            if self.is_relocalising() {
+                self.look_for_robot(scan, motion, &mut update, watch);
+            } else {
+                self.track(&previous, &prior, &mut update, watch);
+            }
             self.monitor_odometry(&by_odometry, &previous, &mut update);
             self.judge_state(scan, &motion.since_previous, &mut update);
             self.register(&mut update, watch);
@@ -123,8 +130,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     ) {
         let scene =
             Scene { observed: self.frontend.segments(), map: self.map.segments(), config: &self.config };
-        let is_lost = self.state.state() == TrackingState::Lost;
-        let tracked = self.tracker.locate(&scene, previous, prior, is_lost, watch);
+        let tracked = self.tracker.track(&scene, previous, prior, watch);
         update.take(&tracked);
         self.estimator.accept(&tracked.hypothesis);
         if let Some(left_out) = &tracked.left_out {
@@ -160,10 +166,18 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
 
     /// Whether the pose is to be relied on, by what the map makes of the scan.
     fn judge_state(&mut self, scan: &Scan<'_>, motion: &Increment, update: &mut SlamUpdate) {
+        if self.is_relocalising() {
+            update.state = self.state.state();
+            return;
+        }
         let pose = self.estimator.pose();
         let evidence = self.tracker.evidence(&self.scene(), scan, &pose, update.support, motion);
         update.contradicted_share = evidence.contradicted_share;
         update.state = self.state.update(&evidence, &self.config.state);
+        if self.is_relocalising() {
+            // It may as well be where it is thought to be.
+            self.relocaliser.begin(Some(self.estimator.local()), &self.places);
+        }
     }
 
     /// From pairs to map.
@@ -206,6 +220,10 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Takes the scan into the places, and does some of their work. Where loops have corrected them, everything moves with them.
     fn keep_places(&mut self, motion: &Increment, update: &mut SlamUpdate) {
         let Some(config) = self.config.places else { return };
+        if update.state == TrackingState::Lost {
+            self.places.pass_blindly(motion);
+            return;
+        }
         let visit = Visit {
             pose: self.estimator.pose(),
             motion: *motion,

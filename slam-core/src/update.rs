@@ -8,8 +8,9 @@ use crate::frontend::extraction::ExtractionReport;
 use crate::map::MapCounters;
 use crate::odometry::wheel_faults::WheelFault;
 use crate::places::Closure;
+use crate::relocalisation::{Relocalisation, Verdict};
 use crate::sensor::scan::{Scan, ScanGeometry};
-use crate::tracking::TrackingState;
+use crate::tracking::{Hypothesis, TrackingState};
 use crate::tracking::correction::{Observability, Prior};
 use crate::tracking::tracker::Tracked;
 
@@ -40,6 +41,8 @@ pub struct Counters {
     pub searched: u32,
     /// Scans at which the robot was lost.
     pub lost: u32,
+    /// Times that a displaced robot found itself in its map.
+    pub relocalised: u32,
 }
 
 impl Counters {
@@ -60,6 +63,8 @@ impl Counters {
         add(&mut self.odometry_left_out, u32::from(update.odometry_left_out));
         add(&mut self.searched, u32::from(update.searched));
         add(&mut self.lost, u32::from(update.state == TrackingState::Lost));
+        let found = update.relocalisation.is_some_and(|r| r.verdict == Verdict::Found);
+        add(&mut self.relocalised, u32::from(found));
     }
 }
 
@@ -158,6 +163,8 @@ pub struct SlamUpdate {
     pub observability: Observability,
     /// Way driven until now, metres.
     pub way_m: f32,
+    /// Set while the robot looks for itself in its map, and when it is found.
+    pub relocalisation: Option<Relocalisation>,
     /// Set when places were corrected by loops, and the map and the pose with them.
     pub closure: Option<Closure>,
     /// Set when the scan was not used. The motion still was.
@@ -190,6 +197,7 @@ impl SlamUpdate {
             wheel_fault: None,
             observability: Observability::BLIND,
             way_m: 0.0,
+            relocalisation: None,
             closure: None,
             rejected: None,
             counters: Counters::default(),
@@ -199,11 +207,15 @@ impl SlamUpdate {
 
     /// Takes what tracking found; the pose goes to the estimator.
     pub(crate) fn take(&mut self, tracked: &Tracked) {
-        self.corrected = tracked.hypothesis.corrected;
+        self.take_pose(&tracked.hypothesis);
         self.iterations = tracked.iterations;
-        self.support = tracked.hypothesis.score;
-        self.observability = tracked.hypothesis.observability;
         self.odometry_left_out = tracked.left_out.is_some();
         self.searched = tracked.searched;
+    }
+    /// Takes what speaks for a pose.
+    pub(crate) fn take_pose(&mut self, hypothesis: &Hypothesis) {
+        self.corrected = hypothesis.corrected;
+        self.support = hypothesis.score;
+        self.observability = hypothesis.observability;
     }
 }

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 use slam_core::SlamUpdate;
+use slam_core::relocalisation::Verdict;
 use slam_core::tracking::TrackingState;
 
 use crate::replay::Step;
@@ -17,6 +18,8 @@ pub struct Tracking {
     pub lost: usize,
     /// Stamp of the first of these, seconds.
     pub first_lost_s: Option<f64>,
+    /// Times that it found itself in its map again.
+    pub relocalised: usize,
     /// Scans that overruled the odometry.
     pub odometry_left_out: usize,
     /// Stamp of the first of these, seconds.
@@ -43,6 +46,7 @@ impl Tracking {
             uncertain: counted(|u| u.state == TrackingState::Uncertain).0,
             lost,
             first_lost_s,
+            relocalised: counted(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::Found)).0,
             odometry_left_out,
             first_left_out_s,
             odometry_useless,
@@ -61,6 +65,10 @@ impl Tracking {
             bad if bad.is_empty() => "all scans".to_owned(),
             bad => format!("{bad} of {scans}"),
         };
+        if self.relocalised > 0 {
+            let times = if self.relocalised == 1 { "once".into() } else { format!("{} times", self.relocalised) };
+            line += &format!("; found itself {times}");
+        }
         let odometry = parts(&[(self.odometry_left_out, "left out"), (self.odometry_useless, "useless")]);
         if !odometry.is_empty() {
             line += &format!("; odometry {odometry}");
@@ -79,6 +87,8 @@ mod tests {
         assert_eq!(tracking.line(), "all scans");
         tracking = Tracking { tracking: 893, uncertain: 12, lost: 3, odometry_left_out: 5, ..tracking };
         assert_eq!(tracking.line(), "12 uncertain, 3 lost of 908; odometry 5 left out");
+        tracking = Tracking { relocalised: 1, odometry_left_out: 0, ..tracking };
+        assert_eq!(tracking.line(), "12 uncertain, 3 lost of 908; found itself once");
         assert_eq!(Tracking::of(&[]), Tracking::default());
     }
 }

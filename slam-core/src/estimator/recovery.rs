@@ -6,6 +6,8 @@ use super::Estimator;
 use crate::config::SlamConfig;
 use crate::ekf::keyframe::{Keyframe, LocalVariance};
 use crate::geometry::pose::{is_finite, normalized};
+use crate::map::SegmentMap;
+use crate::tracking::Hypothesis;
 
 impl Estimator {
     /// Begins anew at a pose that is taken as certain.
@@ -14,6 +16,18 @@ impl Estimator {
         self.restart_way();
         self.local_covariance = Matrix3::zeros();
         self.begin_anew(config);
+    }
+
+    /// Begins anew where the robot was found in its map.
+    pub fn relocate<const N: usize>(&mut self, at: &Hypothesis, config: &SlamConfig, map: &mut SegmentMap<N>) {
+        (self.map_from_base, self.local_covariance) = (at.pose, at.covariance);
+        self.restart_way();
+        self.begin_anew(config);
+        if let Some(filter) = &mut self.filter {
+            filter.inflate_pose(&at.covariance, map);
+        }
+        self.keyframe.local_variance = LocalVariance::of(&at.covariance);
+        self.set_anchor();
     }
 
     /// Begins anew from where the robot stands. Of the filter only the odometry's errors stay.

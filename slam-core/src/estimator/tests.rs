@@ -53,7 +53,7 @@ fn the_motion_s_jacobian_is_the_finite_difference() {
     for from in [Vector3::new(1.0, -2.0, 0.7), Vector3::new(-3.0, 0.5, 3.1)] {
         let at = |off: Vector3<f32>| {
             let c = from + off;
-            estimator.moved(&pose(c.x, c.y, c.z), &increment, &around)
+            estimator.moved(&pose(c.x, c.y, c.z), &increment, around.odometry, around.config)
         };
         let by_pose = at(Vector3::zeros()).by_pose;
         let h = 1e-2;
@@ -81,7 +81,7 @@ fn the_motion_s_jacobian_by_the_odometry_s_errors_is_the_finite_difference() {
                 let mut at = |error: f32| {
                     let bias = OdometryBias(Vector3::ith(k, error));
                     estimator.filter.as_mut().unwrap().set_bias(bias);
-                    estimator.moved(&from, &increment, &around).pose
+                    estimator.moved(&from, &increment, around.odometry, around.config).pose
                 };
                 let slope = difference(&at(h), &at(-h)) / (2.0 * h);
                 let off = slope - jacobian.column(k);

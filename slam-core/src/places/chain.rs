@@ -74,8 +74,7 @@ impl Support {
     /// Takes in a motion, and what the scan after it made of the pose.
     pub fn add(&mut self, motion: &Increment, verdict: Verdict, support: f32) {
         if !motion.is_finite() {
-            self.blind_m += UNKNOWN_M;
-            self.is_low = true;
+            self.lose();
             return;
         }
         self.way_m += motion.distance_m;
@@ -86,6 +85,12 @@ impl Support {
             Verdict::Blind => self.blind_m += motion.distance_m,
         }
         self.is_low |= support < LOW_SUPPORT || verdict == Verdict::Blind;
+    }
+
+    /// The motion since is not known, but for what the map says of it.
+    pub fn lose(&mut self) {
+        self.blind_m += UNKNOWN_M;
+        self.is_low = true;
     }
 
     /// Variances of the motion (along, across, heading), standard deviations times `scale`. For 4 m of way that is well supported 1 cm

@@ -17,6 +17,8 @@ const REACH_M: f32 = 15.0;
 /// Shorter lines do not count, metres, nor what fewer keyframes saw.
 const LEAST_LENGTH_M: f32 = 0.4;
 const LEAST_HITS: u16 = 2;
+/// What one scan sees of a line may be shorter, metres.
+const LEAST_SEEN_M: f32 = 0.25;
 /// Longer lines, and lines seen more often, say no more.
 const MOST_LENGTH_M: f32 = 5.0;
 const MOST_HITS: u16 = 8;
@@ -53,7 +55,7 @@ impl PlaceLine {
 
 /// A line as matching wants it, in the frame of its place.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ray {
+pub(crate) struct Ray {
     pub start: Point2<f32>,
     pub end: Point2<f32>,
     pub middle: Point2<f32>,
@@ -67,27 +69,74 @@ pub(super) struct Ray {
 
 /// The lines of a place, unpacked; those without a length are left out.
 pub(super) fn unpacked(lines: &[PlaceLine]) -> Vec<Ray, PLACE_LINES> {
-    let ray = |line: &PlaceLine| {
-        let [start, end] = line.ends();
-        let along = end - start;
-        let length_m = sqrt(along.norm_squared());
-        if length_m <= 0.0 {
-            return None;
-        }
-        let direction = along / length_m;
-        let normal = perpendicular(direction);
-        Some(Ray {
-            start,
-            end,
-            middle: nalgebra::center(&start, &end),
-            direction,
-            normal,
-            offset_m: normal.dot(&start.coords),
-            length_m,
-            angle_rad: atan2(direction.y, direction.x),
-        })
+    lines.iter().map(PlaceLine::ends).filter_map(|[start, end]| ray(start, end)).take(PLACE_LINES).collect()
+}
+
+/// None without a length.
+fn ray(start: Point2<f32>, end: Point2<f32>) -> Option<Ray> {
+    let along = end - start;
+    let length_m = sqrt(along.norm_squared());
+    if length_m <= 0.0 {
+        return None;
+    }
+    let direction = along / length_m;
+    let normal = perpendicular(direction);
+    Some(Ray {
+        start,
+        end,
+        middle: nalgebra::center(&start, &end),
+        direction,
+        normal,
+        offset_m: normal.dot(&start.coords),
+        length_m,
+        angle_rad: atan2(direction.y, direction.x),
+    })
+}
+
+/// Lines of the map around a pose that are looked through for where a robot is.
+const AROUND: usize = 48;
+
+/// The longest lines of the map that begin within `reach_m` of a pose, in its frame, sorted by direction. Work: a pass over the map.
+pub(super) fn around(map: &[MapSegment], at: &Isometry2<f32>, reach_m: f32) -> Vec<Ray, AROUND> {
+    let is_near = |segment: &Segment| {
+        let nearest = segment.nearest_to(at.translation.vector.into());
+        (nearest.coords - at.translation.vector).norm_squared() <= reach_m * reach_m
     };
-    lines.iter().filter_map(ray).take(PLACE_LINES).collect()
+    let known = map.iter().filter(|entry| entry.hits >= LEAST_HITS).map(|entry| &entry.segment);
+    let longest = longest::<AROUND>(known.filter(|segment| is_near(segment)));
+    let place_from_map = at.inverse();
+    let in_place = |segment: &&Segment| ray(place_from_map * segment.start, place_from_map * segment.end);
+    let mut rays: Vec<Ray, AROUND> = longest.iter().filter_map(in_place).collect();
+    rays.sort_unstable_by(|a, b| a.angle_rad.total_cmp(&b.angle_rad));
+    rays
+}
+
+/// The longest of some segments, in any order.
+fn longest<'a, const N: usize>(segments: impl Iterator<Item = &'a Segment>) -> Vec<&'a Segment, N> {
+    let mut longest: Vec<&Segment, N> = Vec::new();
+    let mut least_m = LEAST_SEEN_M;
+    for segment in segments {
+        if segment.length_m() < least_m {
+            continue;
+        }
+        if longest.push(segment).is_err()
+            && let Some(least) = longest.iter_mut().min_by(|a, b| a.length_m().total_cmp(&b.length_m()))
+        {
+            *least = segment;
+        }
+        if longest.is_full() {
+            least_m = longest.iter().map(|s| s.length_m()).fold(f32::INFINITY, min);
+        }
+    }
+    longest
+}
+
+/// The longest of a scan's segments, in `base`, longest first.
+pub(crate) fn of_scan(observed: &[Segment]) -> Vec<Ray, PLACE_LINES> {
+    let mut rays: Vec<Ray, PLACE_LINES> =
+        longest::<PLACE_LINES>(observed.iter()).iter().filter_map(|s| ray(s.start, s.end)).collect();
+    rays.sort_unstable_by(|a, b| b.length_m.total_cmp(&a.length_m));
+    rays
 }
 
 /// Lines that are chosen from: those of most length and hits.

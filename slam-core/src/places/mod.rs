@@ -33,6 +33,7 @@ use chain::Support;
 pub use chain::{Anchor, Chain};
 pub use factor::LOOPS;
 use finding::{Finder, Known};
+pub(crate) use lines::{Ray, of_scan};
 pub use lines::{PLACE_LINES, PlaceLine};
 pub use solver::Loop;
 use solver::{Progress, Solver};
@@ -126,6 +127,11 @@ pub struct Closure {
 const STEP_M: f32 = 0.06;
 /// … but not more than this.
 const MOST_STEPS: u8 = 12;
+
+/// A robot may stand so far from a place, metres.
+const BESIDE_M: f32 = 2.0;
+/// What stands nearer to a place than this has been seen from there, or on the way to the next, metres.
+const KNOWN_M: f32 = 3.5;
 
 /// Up to `P` places. RAM: 172·`P` bytes and 10 KiB.
 #[derive(Clone, Debug)]
@@ -258,6 +264,11 @@ impl<const P: usize> Places<P> {
         self.support.add(motion, Verdict::Blind, 0.0);
     }
 
+    /// The robot was displaced, and found where the map says: how it came there is not known, and what it is off by from the places before.
+    pub(crate) fn pass_lost(&mut self) {
+        self.support.lose();
+    }
+
     /// Does a bounded bit of work: the lines of a place, or one step of a solution that is on its way, or one of the search for loops.
     /// Returns what all around the robot is to be moved by, where a solution has been swapped in.
     ///
@@ -304,6 +315,29 @@ impl<const P: usize> Places<P> {
                 Some(Closure { moved: normalized(&(new * old.inverse())) })
             }
         }
+    }
+
+    /// Whether the robot has been so close to a point that it would have seen what stands there.
+    pub(crate) fn know(&self, point: Point2<f32>) -> bool {
+        let is_near = |anchor: &Anchor| (anchor.pose.translation.vector - point.coords).norm_squared() < KNOWN_M * KNOWN_M;
+        self.chain.anchors().iter().any(is_near)
+    }
+
+    /// Poses in `map` from which a robot near a place may see these lines, longest first: the best few, whatever is known of where it
+    /// is.
+    ///
+    /// Work: that of [`matching::anywhere`].
+    pub(crate) fn poses_of(
+        &self,
+        place: usize,
+        seen: &[Ray],
+        map: &[MapSegment],
+        reach_m: f32,
+    ) -> impl Iterator<Item = Isometry2<f32>> {
+        let anchor = self.chain.get(place);
+        let pose = anchor.map_or_else(Isometry2::identity, Anchor::pose);
+        let found = anchor.map(|anchor| matching::anywhere(seen, &lines::around(map, &anchor.pose, reach_m + BESIDE_M)));
+        found.into_iter().flatten().map(move |found| normalized(&(pose * found)))
     }
 
     /// What the last solution moved a point by that was seen after a way of `way_m`: as the places before and after, each by its share.

@@ -15,6 +15,7 @@ use crate::odometry::bias::OdometryBias;
 use crate::odometry::health::OdometryHealth;
 use crate::odometry::wheel_faults::WheelFault;
 use crate::places::Places;
+use crate::relocalisation::Relocaliser;
 use crate::sensor::scan::SensorConfig;
 use crate::tracking::state::StateMonitor;
 use crate::tracking::{Tracker, TrackingState};
@@ -70,6 +71,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             places: Places::new(),
             odometry: OdometryHealth::new(config.line_noise, config.odometry.noise),
             state: StateMonitor::default(),
+            relocaliser: Relocaliser::new(),
             counters: Counters::default(),
         }
     }

@@ -38,17 +38,16 @@ impl<const N: usize> Tracker<N> {
         score: f32,
         motion: &Increment,
     ) -> Evidence {
-        let mut contradicted_share = 0.0;
-        if let Some(config) = &scene.config.forgetting
-            && score < scene.config.state.good_score
-        {
-            let (sensor, nearby) = (&scene.config.sensor, self.nearby.all());
-            let view = View::new(scan, pose, sensor, config);
-            let [confirmed, contradicted] = confirmed_and_contradicted(&view, nearby, scene.map);
-            contradicted_share =
-                f32::from(contradicted) / f32::from(confirmed.saturating_add(contradicted).max(1));
-        }
+        let is_good = score >= scene.config.state.good_score;
+        let contradicted_share = if is_good { 0.0 } else { self.contradicted_share(scene, scan, pose) };
         let way_m = motion.distance_m + motion.turn_rad;
         Evidence { score, contradicted_share, segments: scene.observed.len() as u16, way_m }
+    }
+    /// Share of the candidates that should be seen from a pose, and are seen through instead, 0 to 1.
+    pub fn contradicted_share(&self, scene: &Scene<'_>, scan: &Scan<'_>, pose: &Isometry2<f32>) -> f32 {
+        let Some(config) = &scene.config.forgetting else { return 0.0 };
+        let view = View::new(scan, pose, &scene.config.sensor, config);
+        let [confirmed, contradicted] = confirmed_and_contradicted(&view, self.nearby.all(), scene.map);
+        f32::from(contradicted) / f32::from(confirmed.saturating_add(contradicted).max(1))
     }
 }

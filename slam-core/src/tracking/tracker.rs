@@ -7,7 +7,7 @@ use super::heading_search::{self, MAX_PEAKS};
 use super::hypothesis::{Hypothesis, tight_score};
 use crate::config::{Checked, SlamConfig, not_negative};
 use crate::frontend::extraction::MAX_SEGMENTS;
-use crate::geometry::math::{min, sin_cos};
+use crate::geometry::math::min;
 use crate::geometry::pose::{components, difference, perpendicular, pose};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
@@ -58,10 +58,6 @@ pub struct SearchConfig {
     pub suspicious_chi2: f32,
     /// … in so many scans more than it was not: wheels that slip drag the pose along little by little.
     pub suspicious_scans: u8,
-    /// A lost robot is found where so much of the scan is explained, …
-    pub found_score: f32,
-    /// … and so many segments.
-    pub found_segments: f32,
 }
 
 impl SearchConfig {
@@ -112,19 +108,11 @@ impl SearchConfig {
             ("correction.maximum_a_posteriori.search.nothing_score", self.nothing_score),
             ("correction.maximum_a_posteriori.search.wild_chi2", self.wild_chi2),
             ("correction.maximum_a_posteriori.search.suspicious_chi2", self.suspicious_chi2),
-            ("correction.maximum_a_posteriori.search.found_score", self.found_score),
-            ("correction.maximum_a_posteriori.search.found_segments", self.found_segments),
         ];
         fields.into_iter().try_for_each(|(field, value)| not_negative(field, value))
     }
 }
 
-/// A lost robot looks around so many places, one in the middle and the others on a ring of this radius, metres, and from each to
-/// so many sides.
-const PLACES: u8 = 9;
-const RING_M: f32 = 0.8;
-const SIDES: u8 = 6;
-const LOOKS: u8 = PLACES * SIDES;
 /// Larger Mahalanobis distances from the prediction take no more off a hypothesis.
 const MOST_CHI2: f32 = 100.0;
 /// Where the scan overrules the prior, the estimate's covariance before it is made to explain the difference d, as adaptive
@@ -171,8 +159,6 @@ pub struct Tracker<const N: usize> {
     pub pairs: Vec<Pair, MAX_SEGMENTS>,
     shortlist: Shortlist,
     iterations: u8,
-    /// Where a lost robot looks next.
-    looks: u8,
     /// Predictions that were suspiciously far off, less those that were not.
     suspicious: u8,
 }
@@ -185,7 +171,6 @@ impl<const N: usize> Tracker<N> {
             pairs: Vec::new(),
             shortlist: Shortlist::new(),
             iterations: 0,
-            looks: 0,
             suspicious: 0,
         }
     }
@@ -201,30 +186,24 @@ impl<const N: usize> Tracker<N> {
         self.shortlist.clear();
     }
 
+    /// Share of those of the observed segments that count which the map explains from a pose that was just [refined](Self::refined).
+    pub fn score_of(
+        &self,
+        scene: &Scene<'_>,
+        pose: &Isometry2<f32>,
+        counts: impl Fn(&Segment) -> bool,
+    ) -> f32 {
+        tight_score(scene.observed, &self.pairs, scene.map, pose, &scene.config.line_noise, counts).0
+    }
+
+    /// Nothing was matched.
+    pub fn forget_pairs(&mut self) {
+        self.pairs.clear();
+    }
+
     /// The map's segments have new indices.
     pub fn forget_shortlist(&mut self) {
         self.shortlist.clear();
-    }
-
-    /// The same as [`Self::track`] for a robot that may be lost: where the scan is not explained well then, it looks around.
-    pub fn locate(
-        &mut self,
-        scene: &Scene<'_>,
-        previous: &Isometry2<f32>,
-        prior: &Prior,
-        is_lost: bool,
-        watch: &mut impl FnMut(Stage),
-    ) -> Tracked {
-        let mut tracked = self.track(scene, previous, prior, watch);
-        if is_lost && tracked.hypothesis.score < scene.config.state.good_score {
-            if let Some(found) = self.look_around(scene, prior, watch) {
-                tracked.left_out = Some(left_out(&found.pose, &prior.pose));
-                tracked.hypothesis = found;
-            } else {
-                self.associate(scene, &tracked.hypothesis);
-            }
-        }
-        tracked
     }
 
     /// From the prior to the hypothesis that explains the scan best.
@@ -344,7 +323,7 @@ impl<const N: usize> Tracker<N> {
         }
         let line_noise = &scene.config.line_noise;
         (hypothesis.score, hypothesis.explained) =
-            tight_score(scene.observed, &self.pairs, scene.map, &hypothesis.pose, line_noise);
+            tight_score(scene.observed, &self.pairs, scene.map, &hypothesis.pose, line_noise, |_| true);
         hypothesis.paired = self.pairs.len() as u8;
         hypothesis
     }
@@ -384,38 +363,15 @@ impl<const N: usize> Tracker<N> {
         winner
     }
 
-    /// Looks for a lost robot near where it was thought to be: around one of 54 poses, another each time.
-    ///
-    /// Work: that of one search.
-    pub fn look_around(
+    /// A pose that somebody proposes, refined in the map around it.
+    pub fn refined_at(
         &mut self,
         scene: &Scene<'_>,
         prior: &Prior,
         watch: &mut impl FnMut(Stage),
-    ) -> Option<Hypothesis> {
-        let CorrectionConfig::MaximumAPosteriori(config) = &scene.config.correction else { return None };
-        let config = &config.search;
-        let c = components(&prior.pose);
-        let (place, side) = (self.looks % PLACES, self.looks / PLACES);
-        self.looks = (self.looks + 1) % LOOKS;
-        // In the middle, then on a ring.
-        let radius_m = if place == 0 { 0.0 } else { RING_M };
-        let (sin, cos) = sin_cos(f32::from(place) * (2.0 * core::f32::consts::PI / f32::from(PLACES - 1)));
-        let turn = f32::from(side) * (2.0 * core::f32::consts::PI / f32::from(SIDES));
-        let centre = pose(c.x + radius_m * cos, c.y + radius_m * sin, c.z + turn);
-        let broad = Prior { pose: centre, covariance: variances([RING_M, config.reach_rad]) };
-        let mut least = config.found_score;
-        let mut winner = None;
-        self.propose(scene, &broad, config, watch, &mut |hypothesis| {
-            if hypothesis.score > least && hypothesis.explained >= config.found_segments {
-                (least, winner) = (hypothesis.score, Some(hypothesis));
-            }
-        });
-        if let Some(winner) = &winner {
-            self.gather(scene.map, &winner.pose, scene.config);
-            self.associate(scene, winner);
-        }
-        winner
+    ) -> Hypothesis {
+        self.gather(scene.map, &prior.pose, scene.config);
+        self.refined(scene, prior, Hypothesis::of_prior(prior), Kernel::Strict, watch)
     }
 
     /// Makes a hypothesis of each pose that the scan itself proposes around a prior.

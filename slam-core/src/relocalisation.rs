@@ -1,0 +1,340 @@
+//! Finding a robot in its map, wherever it is: after it was lifted, or where it takes up a map without knowing where it stands.
+//!
+//! In: scans, the motions between them, places and map. Out: the pose, or that it is not known. Each scan is laid on the lines of a few
+//! places, whichever come next, by corners, as for loops but without a gate; what fits is looked at in the map itself, by the lines that it
+//! explains and by those it sees through. What holds is kept as one of a few guesses, which move with the odometry and are looked at
+//! again with each scan. One wins when all places have been asked, when it has explained the scans on some way, and when no other explains
+//! them nearly as well: in two rooms alike there are two, until the robot has seen what tells them apart.
+//!
+//! Reference: Jensfelt and Kristensen, "Active global localization for a mobile robot using multiple hypothesis tracking", IEEE
+//! Transactions on Robotics and Automation 17(5), 2001.
+
+use heapless::Vec;
+use nalgebra::{Isometry2, Matrix3, Vector3};
+
+use crate::config::{Checked, check, not_negative};
+use crate::geometry::math::{max, min};
+use crate::geometry::pose::components;
+use crate::geometry::segment::Segment;
+use crate::odometry::Increment;
+use crate::places::{Places, of_scan};
+use crate::sensor::scan::Scan;
+use crate::slam::Stage;
+use crate::tracking::correction::Prior;
+use crate::tracking::tracker::Scene;
+use crate::tracking::{Hypothesis, Tracker};
+
+/// Settings of relocalisation. Chosen on simulated lifts in hall, office, flat, lab and twins (seeds 1 to 5, two places each).
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct RelocalisationConfig {
+    /// Places that each scan is compared with.
+    pub places_per_scan: u8,
+    /// Guesses that are looked at with each scan; they take turns.
+    pub guesses_per_scan: u8,
+    /// Scans with fewer segments say nothing.
+    pub least_segments: u8,
+    /// A pose is a guess as long as it explains this share of the scans, …
+    pub least_support: f32,
+    /// … and is where the robot is, where it explains this share, on the mean, …
+    pub min_support: f32,
+    /// … and any other pose not more than this share of that, …
+    pub max_runner_up: f32,
+    /// … or leaves so many times as much of them unexplained.
+    pub min_odds: f32,
+    /// Scans that it must have explained.
+    pub scans: u8,
+    /// Its lead, by the share of the scans, summed over scans that lie so far apart, metres (a radian counts as a metre), …
+    pub apart_m: f32,
+    /// … must be this.
+    pub min_lead: f32,
+    /// Way after which a robot goes on from where it is thought to be, metres, if nothing in the map explains what it sees: it is where
+    /// nothing has been mapped.
+    pub give_up_m: f32,
+}
+
+impl RelocalisationConfig {
+    pub(crate) fn validate(&self) -> Checked {
+        check("relocalisation.places_per_scan", self.places_per_scan > 0)?;
+        check("relocalisation.guesses_per_scan", self.guesses_per_scan > 0)?;
+        let fields = [
+            ("relocalisation.least_support", self.least_support),
+            ("relocalisation.min_support", self.min_support),
+            ("relocalisation.max_runner_up", self.max_runner_up),
+            ("relocalisation.min_odds", self.min_odds),
+            ("relocalisation.apart_m", self.apart_m - 1e-3),
+            ("relocalisation.min_lead", self.min_lead),
+            ("relocalisation.give_up_m", self.give_up_m),
+        ];
+        fields.into_iter().try_for_each(|(field, value)| not_negative(field, value))
+    }
+}
+
+/// Most guesses.
+pub const GUESSES: usize = 16;
+/// Scans that the mean of what a guess explains goes back, about.
+const MEMORY: f32 = 20.0;
+/// A guess that has explained fewer scans is no rival yet.
+const RIVAL_SCANS: u8 = 3;
+/// Guesses that come as close as this, metres and radians, are one, …
+const SAME: [f32; 2] = [0.5, 0.26];
+/// … and one that explains so much more shows where the other should be.
+const BETTER: f32 = 0.1;
+/// How far off a pose may be that is proposed by a place: standard deviations, metres and radians.
+const PROPOSED: [f32; 2] = [0.2, 0.1];
+/// Share of a scan that must lie where the map knows what stands, or it says nothing of a guess.
+const LEAST_KNOWN: f32 = 0.33;
+
+/// Where the robot may be.
+#[derive(Clone, Copy, Debug)]
+pub struct Guess {
+    /// Pose of `base` in `map`, …
+    pub pose: Isometry2<f32>,
+    /// … and its covariance (x, y, θ).
+    pub covariance: Matrix3<f32>,
+    /// Share of the scans that it explains, less what it says should be seen and is seen through: 0 to 1, the mean over the last ones.
+    pub support: f32,
+    /// Scans that it was held against, …
+    pub scans: u8,
+    /// … and the way since it was proposed, metres; a radian counts as a metre.
+    pub way_m: f32,
+}
+
+/// What is known of where a robot is that looks for itself.
+#[derive(Clone, Copy, Debug)]
+pub struct Relocalisation {
+    /// The best guess, if there is one.
+    pub best: Option<Guess>,
+    /// Support of the best guess that is elsewhere.
+    pub runner_up: f32,
+    /// Whether every place has been asked.
+    pub complete: bool,
+    /// How it stands.
+    pub verdict: Verdict,
+}
+
+/// How the search stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Verdict {
+    /// It is not known where the robot is.
+    Searching,
+    /// The best guess is where it is.
+    Found,
+    /// Nothing in the map explains what is seen: the robot goes on from where it is thought to be.
+    GivenUp,
+}
+
+/// What a guess is held against.
+pub(crate) struct Evidence<'a, const P: usize> {
+    pub scene: Scene<'a>,
+    pub scan: &'a Scan<'a>,
+    pub places: &'a Places<P>,
+    /// The motion since the scan before, by odometry.
+    pub motion: &'a Increment,
+}
+
+/// The guesses, and which places come next. RAM: 1 KiB.
+#[derive(Clone, Debug)]
+pub(crate) struct Relocaliser {
+    guesses: Vec<Guess, GUESSES>,
+    /// The guess that is looked at next.
+    next_guess: u8,
+    /// Places that are still to be asked, from the newest to the oldest.
+    places_left: u16,
+    complete: bool,
+    way_m: f32,
+}
+
+impl Relocaliser {
+    pub const fn new() -> Self {
+        Self { guesses: Vec::new(), next_guess: 0, places_left: 0, complete: false, way_m: 0.0 }
+    }
+
+    /// Begins anew: the robot may be anywhere, as well as where it is thought to be.
+    pub fn begin<const P: usize>(&mut self, thought: Option<Prior>, places: &Places<P>) {
+        *self = Self { places_left: places.anchors().len() as u16, ..Self::new() };
+        if let Some(at) = thought {
+            let _ = self.guesses.push(Guess::at(at));
+        }
+    }
+
+    /// Where the robot may be.
+    pub fn guesses(&self) -> &[Guess] {
+        &self.guesses
+    }
+
+    /// Takes in a scan. `predicted` moves a pose by the odometry.
+    ///
+    /// Work: some guesses, and for a few places those of [`Places::poses_of`], each refined in the map.
+    pub fn step<const N: usize, const P: usize>(
+        &mut self,
+        evidence: &Evidence<'_, P>,
+        tracker: &mut Tracker<N>,
+        predicted: impl Fn(&Prior) -> Prior,
+        config: &RelocalisationConfig,
+        watch: &mut impl FnMut(Stage),
+    ) -> Relocalisation {
+        let way_m = evidence.motion.distance_m + evidence.motion.turn_rad.abs();
+        self.way_m += way_m;
+        for guess in &mut self.guesses {
+            let prior = predicted(&guess.prior());
+            (guess.pose, guess.covariance) = (prior.pose, prior.covariance);
+            guess.way_m += way_m;
+        }
+        if evidence.scene.observed.len() >= usize::from(config.least_segments) {
+            self.look_at_guesses(evidence, tracker, config, watch);
+            self.ask_places(evidence, tracker, config, watch);
+            self.merge();
+        }
+        self.judge(config)
+    }
+
+    /// Holds the scan against those of the guesses whose turn it is.
+    fn look_at_guesses<const N: usize, const P: usize>(
+        &mut self,
+        evidence: &Evidence<'_, P>,
+        tracker: &mut Tracker<N>,
+        config: &RelocalisationConfig,
+        watch: &mut impl FnMut(Stage),
+    ) {
+        let count = self.guesses.len();
+        for _ in 0..count.min(config.guesses_per_scan.into()) {
+            let index = usize::from(self.next_guess) % count;
+            self.next_guess = (index + 1) as u8;
+            if let Some(guess) = self.guesses.get_mut(index)
+                && let Some((hypothesis, support)) = held_against(evidence, &guess.prior(), tracker, watch)
+            {
+                guess.take(&hypothesis, support);
+            }
+        }
+        self.guesses.retain(|guess| guess.scans == 0 || guess.support >= config.least_support);
+    }
+
+    /// Compares the scan with the next places.
+    fn ask_places<const N: usize, const P: usize>(
+        &mut self,
+        evidence: &Evidence<'_, P>,
+        tracker: &mut Tracker<N>,
+        config: &RelocalisationConfig,
+        watch: &mut impl FnMut(Stage),
+    ) {
+        let seen = of_scan(evidence.scene.observed);
+        for _ in 0..config.places_per_scan {
+            let Some(place) = self.places_left.checked_sub(1) else { break };
+            self.places_left = place;
+            let (map, sensor) = (evidence.scene.map, &evidence.scene.config.sensor);
+            for pose in evidence.places.poses_of(place.into(), &seen, map, sensor.reach_m()) {
+                let proposed = Prior { pose, covariance: variances(PROPOSED) };
+                if let Some((hypothesis, support)) = held_against(evidence, &proposed, tracker, watch)
+                    && support >= config.least_support
+                {
+                    let mut guess = Guess::at(proposed);
+                    guess.take(&hypothesis, support);
+                    self.add(guess);
+                }
+            }
+        }
+        if self.places_left == 0 {
+            (self.places_left, self.complete) = (evidence.places.anchors().len() as u16, true);
+        }
+    }
+
+    fn add(&mut self, new: Guess) {
+        if let Some(same) = self.guesses.iter_mut().find(|guess| guess.is_same(&new)) {
+            if new.support > same.support + BETTER {
+                (same.pose, same.covariance) = (new.pose, new.covariance);
+            }
+        } else if self.guesses.push(new).is_err()
+            && let Some(worst) = self.guesses.iter_mut().min_by(|a, b| a.support.total_cmp(&b.support))
+            && worst.support < new.support
+        {
+            *worst = new;
+        }
+    }
+
+    /// Guesses that have come together are one: the older.
+    fn merge(&mut self) {
+        for index in (1..self.guesses.len()).rev() {
+            let (before, rest) = self.guesses.split_at(index);
+            let is_double = rest.first().is_some_and(|guess| before.iter().any(|other| other.is_same(guess)));
+            if is_double {
+                self.guesses.remove(index);
+            }
+        }
+    }
+
+    fn judge(&self, config: &RelocalisationConfig) -> Relocalisation {
+        let best = self.guesses.iter().max_by(|a, b| a.support.total_cmp(&b.support)).copied();
+        let is_rival = |guess: &&Guess| {
+            guess.scans >= RIVAL_SCANS && best.is_some_and(|best| !best.is_same(guess))
+        };
+        let runner_up = self.guesses.iter().filter(is_rival).map(|g| g.support).fold(0.0, max);
+        let explains = best.is_some_and(|best| best.support >= config.min_support);
+        let verdict = match best {
+            Some(best) if self.complete && explains && best.stands_out(runner_up, config) => Verdict::Found,
+            _ if self.complete && !explains && self.way_m >= config.give_up_m => Verdict::GivenUp,
+            _ => Verdict::Searching,
+        };
+        Relocalisation { best, runner_up, complete: self.complete, verdict }
+    }
+}
+
+impl Guess {
+    fn at(prior: Prior) -> Self {
+        Self { pose: prior.pose, covariance: prior.covariance, support: 0.0, scans: 0, way_m: 0.0 }
+    }
+
+    /// As a prior.
+    pub(crate) fn prior(&self) -> Prior {
+        Prior { pose: self.pose, covariance: self.covariance }
+    }
+
+    fn take(&mut self, hypothesis: &Hypothesis, support: f32) {
+        (self.pose, self.covariance) = (hypothesis.pose, hypothesis.covariance);
+        self.scans = self.scans.saturating_add(1);
+        self.support += max(1.0 / f32::from(self.scans), 1.0 / MEMORY) * (support - self.support);
+    }
+
+    fn is_same(&self, other: &Guess) -> bool {
+        let off = components(&self.pose.inv_mul(&other.pose));
+        off.xy().norm() < SAME[0] && off.z.abs() < SAME[1]
+    }
+
+    /// Whether it leaves no doubt.
+    fn stands_out(&self, runner_up: f32, config: &RelocalisationConfig) -> bool {
+        let is_far_better = runner_up <= config.max_runner_up * self.support
+            || 1.0 - runner_up >= config.min_odds * (1.0 - self.support);
+        // Scans from where the robot stands say the same.
+        let scans = min(f32::from(self.scans), self.way_m / config.apart_m);
+        is_far_better && self.scans >= config.scans && (self.support - runner_up) * scans >= config.min_lead
+    }
+}
+
+/// Lays the scan on the map around a pose: the pose refined, and the share of the scan that speaks for it, of what lies where the map knows
+/// what stands. None where that is little.
+fn held_against<const N: usize, const P: usize>(
+    evidence: &Evidence<'_, P>,
+    prior: &Prior,
+    tracker: &mut Tracker<N>,
+    watch: &mut impl FnMut(Stage),
+) -> Option<(Hypothesis, f32)> {
+    let Evidence { scene, scan, places, .. } = evidence;
+    let hypothesis = tracker.refined_at(scene, prior, watch);
+    let pose = hypothesis.pose;
+    let is_known = |segment: &Segment| places.know(pose * segment.midpoint());
+    let points = |segment: &Segment| segment.moments.inliers as f32;
+    let all: f32 = scene.observed.iter().map(points).sum();
+    let known: f32 = scene.observed.iter().filter(|s| is_known(s)).map(points).sum();
+    if known < LEAST_KNOWN * all {
+        return None;
+    }
+    let contradicted = tracker.contradicted_share(scene, scan, &pose);
+    let support = tracker.score_of(scene, &pose, is_known) * (1.0 - contradicted);
+    Some((hypothesis, support))
+}
+
+fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
+    Matrix3::from_diagonal(&Vector3::new(position * position, position * position, heading * heading))
+}

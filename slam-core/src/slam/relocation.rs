@@ -1,0 +1,63 @@
+//! A robot that was displaced looks for itself in its map.
+
+use super::Slam;
+use crate::odometry::track::ScanMotion;
+use crate::relocalisation::{Evidence, Guess, Verdict};
+use crate::sensor::scan::Scan;
+use crate::tracking::correction::Prior;
+use crate::tracking::tracker::Scene;
+use crate::update::{SlamUpdate, Stage};
+
+impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
+    /// The robot may be anywhere in its map: it is [`Lost`](crate::tracking::TrackingState::Lost) from now on, and looks for itself with each
+    /// scan. [`SlamUpdate::relocalisation`] says what is known; once it is found the robot goes on from there. Nothing happens where
+    /// the configuration has no [`relocalisation`](crate::SlamConfig::relocalisation).
+    pub fn relocalise(&mut self) {
+        if self.config.relocalisation.is_some() {
+            self.state.displace();
+            self.relocaliser.begin(None, &self.places);
+        }
+    }
+
+    /// Where a robot may be that is looking for itself.
+    pub fn guesses(&self) -> &[Guess] {
+        self.relocaliser.guesses()
+    }
+
+    /// Whether the pose is not tracked, but looked for.
+    pub(super) fn is_relocalising(&self) -> bool {
+        self.config.relocalisation.is_some() && self.state.is_displaced()
+    }
+
+    /// Takes a scan to look for the robot; where it is found it goes on from there.
+    pub(super) fn look_for_robot(
+        &mut self,
+        scan: &Scan<'_>,
+        motion: &ScanMotion,
+        update: &mut SlamUpdate,
+        watch: &mut impl FnMut(Stage),
+    ) {
+        let Self { config, map, estimator, frontend, tracker, places, odometry, relocaliser, state, .. } = self;
+        let Some(settings) = &config.relocalisation else { return };
+        let scene = Scene { observed: frontend.segments(), map: map.segments(), config };
+        let motion = &motion.since_previous;
+        let evidence = Evidence { scene, scan, places, motion };
+        let predicted = |at: &Prior| estimator.predicted(at, motion, odometry, config);
+        let outcome = relocaliser.step(&evidence, tracker, predicted, settings, watch);
+        update.relocalisation = Some(outcome);
+        let at = match (outcome.verdict, outcome.best) {
+            (Verdict::Found, Some(found)) => found.prior(),
+            (Verdict::GivenUp, _) => estimator.local(),
+            _ => {
+                tracker.forget_pairs();
+                return;
+            }
+        };
+        let hypothesis = tracker.refined_at(&scene, &at, watch);
+        update.take_pose(&hypothesis);
+        estimator.relocate(&hypothesis, config, map);
+        places.pass_lost();
+        odometry.map_moved();
+        state.found();
+    }
+}

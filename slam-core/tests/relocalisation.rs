@@ -1,0 +1,189 @@
+//! A robot that is lifted and put down elsewhere finds itself, or says that it does not know.
+
+#![allow(clippy::disallowed_methods)]
+
+use nalgebra::{Isometry2, Point2, Vector2};
+use slam_core::geometry::pose::pose;
+use slam_core::odometry::Increment;
+use slam_core::relocalisation::Verdict;
+use slam_core::tracking::TrackingState;
+use slam_core::{Scan, ScanMotion, Slam, SlamConfig, SlamUpdate};
+
+const BEAMS: usize = 682;
+type Wall = ((f32, f32), (f32, f32));
+
+/// A room of 5 m by 4 m whose lower left corner is there, with a cupboard, a shelf askew and a recess; its door leads down.
+fn room(x: f32, y: f32) -> Vec<Wall> {
+    let walls = [
+        ((0.0, 0.0), (2.0, 0.0)),
+        ((3.0, 0.0), (5.0, 0.0)),
+        ((5.0, 0.0), (5.0, 4.0)),
+        ((5.0, 4.0), (3.2, 4.0)),
+        ((3.2, 4.0), (3.2, 4.4)),
+        ((3.2, 4.4), (1.5, 4.4)),
+        ((1.5, 4.4), (1.5, 4.0)),
+        ((1.5, 4.0), (0.0, 4.0)),
+        ((0.0, 4.0), (0.0, 0.0)),
+        ((5.0, 1.2), (4.3, 1.2)),
+        ((4.3, 1.2), (4.3, 2.1)),
+        ((4.3, 2.1), (5.0, 2.1)),
+        ((0.0, 2.6), (0.9, 3.1)),
+    ];
+    walls.map(|((ax, ay), (bx, by))| ((ax + x, ay + y), (bx + x, by + y))).to_vec()
+}
+
+/// Two rooms alike on a corridor, which a cabinet at its right end tells apart.
+fn twins() -> Vec<Wall> {
+    let mut walls = [room(0.0, 1.5), room(5.0, 1.5)].concat();
+    walls.extend([((0.0, 0.0), (10.0, 0.0)), ((10.0, 0.0), (10.0, 1.5)), ((0.0, 1.5), (0.0, 0.0))]);
+    walls.extend([((9.0, 0.0), (9.0, 0.5)), ((9.0, 0.5), (9.6, 0.5)), ((9.6, 0.5), (9.6, 0.0))]);
+    walls
+}
+
+fn ranges_mm(walls: &[Wall], config: &SlamConfig, map_from_base: &Isometry2<f32>) -> Vec<u16> {
+    let map_from_laser = map_from_base * config.sensor.mounting.base_from_laser;
+    let cross = |a: Vector2<f32>, b: Vector2<f32>| a.x * b.y - a.y * b.x;
+    let range_mm = |beam| {
+        let bearing = config.sensor.geometry.bearing(beam);
+        let direction = map_from_laser.rotation * Vector2::new(bearing.cos(), bearing.sin());
+        let hits = walls.iter().filter_map(|&((x1, y1), (x2, y2))| {
+            let from = Point2::new(x1, y1) - Point2::from(map_from_laser.translation.vector);
+            let along = Vector2::new(x2 - x1, y2 - y1);
+            let denominator = cross(direction, along);
+            let (range, share) = (cross(from, along) / denominator, cross(from, direction) / denominator);
+            ((0.0..=1.0).contains(&share) && range > 0.02).then_some(range)
+        });
+        let range = hits.fold(f32::INFINITY, f32::min);
+        if range < 4.0 { (range * 1000.0).round() as u16 } else { 0 }
+    };
+    (0..BEAMS).map(range_mm).collect()
+}
+
+struct Drive {
+    walls: Vec<Wall>,
+    config: SlamConfig,
+    slam: Box<Slam<128>>,
+    start: Isometry2<f32>,
+    truth: Isometry2<f32>,
+}
+
+impl Drive {
+    fn new(walls: Vec<Wall>, start: Isometry2<f32>) -> Self {
+        let config = SlamConfig::default();
+        Self { walls, config, slam: Box::new(Slam::new(config).unwrap()), start, truth: start }
+    }
+
+    fn step(&mut self, motion: Isometry2<f32>) -> SlamUpdate {
+        self.truth *= motion;
+        let ranges_mm = ranges_mm(&self.walls, &self.config, &self.truth);
+        let motion = ScanMotion::instantaneous(Increment::from_motion(motion));
+        self.slam.process_scan(&Scan { ranges_mm: &ranges_mm }, &motion)
+    }
+
+    /// Turns towards a point and drives there.
+    fn to(&mut self, x: f32, y: f32) -> Vec<SlamUpdate> {
+        let mut updates = Vec::new();
+        for _ in 0..400 {
+            let ahead = self.truth.inverse() * Point2::new(x, y);
+            let angle = ahead.y.atan2(ahead.x);
+            if ahead.coords.norm() < 0.05 {
+                break;
+            }
+            let turn = angle.clamp(-0.12, 0.12);
+            updates.push(self.step(pose(if angle.abs() < 0.2 { 0.04 } else { 0.0 }, 0.0, turn)));
+        }
+        updates
+    }
+
+    fn stand(&mut self, scans: usize) -> Vec<SlamUpdate> {
+        (0..scans).map(|_| self.step(pose(0.0, 0.0, 0.0))).collect()
+    }
+
+    fn off(&self) -> (f32, f32) {
+        let off = self.start.inv_mul(&self.truth).inv_mul(&self.slam.pose());
+        (off.translation.vector.norm(), off.rotation.angle().abs())
+    }
+}
+
+fn found(updates: &[SlamUpdate]) -> Option<usize> {
+    updates.iter().position(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::Found))
+}
+
+#[test]
+fn a_lifted_robot_says_that_it_is_lost_and_finds_itself() {
+    let mut drive = Drive::new(room(0.0, 0.0), pose(1.0, 1.0, 0.0));
+    for (x, y) in [(3.5, 1.0), (3.5, 3.0), (1.5, 3.0), (1.5, 1.0), (3.5, 1.0)] {
+        drive.to(x, y);
+    }
+    assert!(drive.off().0 < 0.05 && drive.slam.state() == TrackingState::Tracking);
+    let lines = drive.slam.map().segments().len();
+    drive.truth = pose(1.2, 3.2, -2.0);
+    let standing = drive.stand(8);
+    assert!(standing.iter().any(|u| u.state == TrackingState::Lost), "it does not notice");
+    let driving = drive.to(3.0, 2.8);
+    let scans = found(&driving).expect("it does not find itself");
+    assert!(scans < 50, "after {scans} scans");
+    let (off_m, off_rad) = drive.off();
+    assert!(off_m < 0.05 && off_rad < 0.03, "{off_m} {off_rad}");
+    assert_eq!((drive.slam.state(), drive.slam.counters().relocalised), (TrackingState::Tracking, 1));
+    let now = drive.slam.map().segments().len();
+    assert!(now <= lines + 3, "it has drawn what it saw where it was not: {lines} lines, {now} now");
+}
+
+#[test]
+fn in_two_rooms_alike_it_is_not_sure_until_it_has_left() {
+    let mut drive = Drive::new(twins(), pose(0.6, 0.75, 0.0));
+    for x in [2.5, 7.5, 2.5] {
+        for (dx, y) in [(0.0, 0.75), (0.0, 2.5), (1.0, 4.0), (-1.0, 4.0), (0.0, 2.5), (0.0, 0.75)] {
+            drive.to(x + dx, y);
+        }
+    }
+    drive.to(8.2, 0.75);
+    drive.to(2.5, 0.75);
+    assert!(drive.off().0 < 0.1, "{:?}", drive.off());
+    // From the corridor into the right one of both.
+    drive.truth = pose(7.5, 3.5, 2.0);
+    assert!(drive.stand(8).iter().any(|u| u.state == TrackingState::Lost));
+    let inside = [drive.to(6.5, 4.5), drive.to(8.2, 4.2), drive.to(7.5, 2.8)].concat();
+    assert_eq!(found(&inside), None, "nothing in there tells which it is");
+    assert_eq!(drive.slam.state(), TrackingState::Lost);
+    let guesses = drive.slam.guesses().iter().filter(|g| g.support > 0.8).count();
+    assert!(guesses >= 2, "{guesses}");
+    let outside = [drive.to(7.5, 0.75), drive.to(8.2, 0.75), drive.to(7.0, 0.75)].concat();
+    assert!(found(&outside).is_some() && drive.off().0 < 0.1, "{:?}", drive.off());
+}
+
+#[test]
+fn where_nothing_has_been_mapped_it_goes_on_in_the_end() {
+    let mut walls = room(0.0, 0.0);
+    walls.extend(twins().iter().map(|&((ax, ay), (bx, by))| ((ax * 0.7, ay + 50.0), (bx * 0.7, by + 50.0))));
+    let mut drive = Drive::new(walls, pose(1.0, 1.0, 0.0));
+    for (x, y) in [(3.5, 1.0), (3.5, 3.0), (1.5, 3.0)] {
+        drive.to(x, y);
+    }
+    drive.truth = pose(1.0, 50.7, 0.0);
+    let mut updates = drive.stand(8);
+    for _ in 0..3 {
+        updates.extend(drive.to(5.0, 50.7));
+        updates.extend(drive.to(1.0, 50.7));
+    }
+    let last = updates.iter().filter_map(|u| u.relocalisation).last().expect("it was lost");
+    assert_eq!((last.verdict, found(&updates)), (Verdict::GivenUp, None));
+    assert!(drive.slam.state() != TrackingState::Lost);
+}
+
+#[test]
+fn a_robot_that_may_be_anywhere_asks_to_be_found() {
+    let mut drive = Drive::new(room(0.0, 0.0), pose(1.0, 1.0, 0.0));
+    for (x, y) in [(3.5, 1.0), (3.5, 3.0), (1.5, 3.0)] {
+        drive.to(x, y);
+    }
+    drive.slam.relocalise();
+    assert_eq!(drive.slam.state(), TrackingState::Lost);
+    let driving = [drive.to(2.5, 1.0), drive.to(3.5, 1.0)].concat();
+    assert!(found(&driving).is_some() && drive.off().0 < 0.05, "{:?}", drive.off());
+    // The paper knows nothing of it.
+    let mut paper = Slam::<64>::new(SlamConfig::paper()).unwrap();
+    paper.relocalise();
+    assert_eq!(paper.state(), TrackingState::Tracking);
+}
