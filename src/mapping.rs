@@ -180,7 +180,9 @@ impl Mapping {
             match state {
                 TrackingState::Tracking => defmt::info!("tracking again"),
                 TrackingState::Uncertain => defmt::warn!("the pose is uncertain"),
-                TrackingState::Lost => defmt::warn!("the robot is lost and looks for itself: nothing enters the map"),
+                TrackingState::Lost => {
+                    defmt::warn!("the robot is lost and looks for itself: nothing enters the map")
+                }
             }
         }
         if core::mem::replace(&mut self.fault, fault) != fault {

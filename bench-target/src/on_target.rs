@@ -12,6 +12,7 @@ use slam_core::geometry::segment::Moments;
 use slam_core::odometry::Increment;
 use slam_core::odometry::track::SWEEP_KNOTS;
 use slam_core::slam::Stage;
+use slam_core::tracking::TrackingState;
 use slam_core::{MapSegment, Scan, ScanMotion, Segment, Slam, SlamConfig};
 
 /// How the robot moved for a scan: since the scan before, and during it.
@@ -31,6 +32,8 @@ const KNOWN: [usize; 3] = [50, 200, 500];
 /// Wheels that slip: in one of so many scans the odometry is off by this turn, radians, so that the pose must be searched for.
 const SLIP_SCANS: usize = 5;
 const SLIP_RAD: f32 = 0.4;
+/// Scans until a robot is told that it may be anywhere: it has some places by then.
+const PLACED_SCANS: usize = 150;
 /// Turns of a loop counted by hand.
 const TURNS: u32 = 1000;
 /// Times that a function is called.
@@ -48,11 +51,14 @@ fn main() -> ! {
         [("default", SlamConfig::default as fn() -> SlamConfig), ("paper", SlamConfig::paper)]
     {
         for known in KNOWN {
-            run(name, config(), known, None);
+            run(name, config(), known, Trouble::None);
         }
     }
     for known in KNOWN {
-        run("slipping", SlamConfig::default(), known, Some(SLIP_RAD));
+        run("slipping", SlamConfig::default(), known, Trouble::Slips);
+    }
+    for known in KNOWN {
+        run("relocalising", SlamConfig::default(), known, Trouble::Lost);
     }
     defmt::println!("end of benchmark");
     loop {
@@ -60,8 +66,19 @@ fn main() -> ! {
     }
 }
 
-/// The fixed set of scans through the core, with so many segments known, and with wheels that slip or do not.
-fn run(name: &str, config: SlamConfig, known: usize, slip_rad: Option<f32>) {
+/// What the robot is up against.
+#[derive(Clone, Copy, PartialEq)]
+enum Trouble {
+    /// Nothing.
+    None,
+    /// Wheels that slip.
+    Slips,
+    /// It is told again and again that it may be anywhere.
+    Lost,
+}
+
+/// The fixed set of scans through the core, with so many segments known.
+fn run(name: &str, config: SlamConfig, known: usize, trouble: Trouble) {
     static mut SLAM: MaybeUninit<Slam<CAPACITY>> = MaybeUninit::uninit();
     // SAFETY: called from the only thread there is, and never from within itself.
     let place = unsafe { &mut *core::ptr::addr_of_mut!(SLAM) };
@@ -74,9 +91,12 @@ fn run(name: &str, config: SlamConfig, known: usize, slip_rad: Option<f32>) {
     defmt::println!("run {=str} {=usize}", name, known);
     for (k, (ranges_mm, motion)) in RANGES_MM.iter().zip(&MOTIONS).enumerate() {
         let mut motion = scan_motion(motion);
-        if let Some(slip_rad) = slip_rad.filter(|_| k % SLIP_SCANS == SLIP_SCANS - 1) {
-            motion.since_previous.before_from_after *= pose(0.0, 0.0, slip_rad);
-            motion.since_previous.turn_rad += slip_rad;
+        if trouble == Trouble::Slips && k % SLIP_SCANS == SLIP_SCANS - 1 {
+            motion.since_previous.before_from_after *= pose(0.0, 0.0, SLIP_RAD);
+            motion.since_previous.turn_rad += SLIP_RAD;
+        }
+        if trouble == Trouble::Lost && k >= PLACED_SCANS && slam.state() != TrackingState::Lost {
+            slam.relocalise();
         }
         let searched = slam.counters().searched;
         let mut cycles = [0u32; Stage::COUNT];
@@ -91,7 +111,7 @@ fn run(name: &str, config: SlamConfig, known: usize, slip_rad: Option<f32>) {
         let points = update.deskew.points;
         let keyframe = update.registration.keyframe;
         let segments = slam.map().segments().len();
-        let searched = slam.counters().searched > searched;
+        let searched = slam.counters().searched > searched || update.relocalisation.is_some();
         defmt::println!(
             "scan {} {=u32} {=bool} {=usize} {=bool}",
             cycles,

@@ -8,6 +8,7 @@ pub mod calibrate;
 pub mod configuration;
 pub mod experiments;
 pub mod log;
+pub mod map_file;
 pub mod output;
 pub mod replay;
 pub mod score;

@@ -11,6 +11,7 @@ use lineslam::benchmark::BenchmarkError;
 use lineslam::calibrate::CalibrationError;
 use lineslam::experiments::ExperimentError;
 use lineslam::log::LogError;
+use lineslam::map_file::MapFileError;
 use lineslam::replay::ReplayError;
 use lineslam::score::ScoreError;
 use lineslam::sim::BadSetting;
@@ -58,6 +59,7 @@ fn main() -> ExitCode {
             eprintln!("error: {error:#}");
             let bad_input = error.is::<LogError>()
                 || error.is::<FileError>()
+                || error.is::<MapFileError>()
                 || error.is::<ReplayError>()
                 || error.is::<ScoreError>()
                 || error.is::<BenchmarkError>()

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use nalgebra::Isometry2;
 use slam_core::config::ConfigError;
 use slam_core::geometry::pose::pose;
+use slam_core::map::store::MapError;
 use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::delay::Delay;
 use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
@@ -13,6 +14,7 @@ use slam_core::slam::Counters;
 use slam_core::{Mapper, ScanMotion, Slam, SlamConfig, SlamUpdate, WheelTicks};
 
 use crate::log::{Log, Odometry};
+use crate::map_file::MapFile;
 use crate::robot::{Robot, Wheels};
 
 /// Map segments of the replayed `Slam`: what the firmware has.
@@ -49,6 +51,9 @@ pub enum ReplayError {
         /// Name of the robot.
         robot: String,
     },
+    /// The map to begin in cannot be used.
+    #[error("the map")]
+    Map(#[from] MapError),
     /// Robot and configuration do not make sense together.
     #[error("robot '{robot}'")]
     Config {
@@ -83,6 +88,8 @@ pub struct Step {
 pub struct Replay {
     /// Scan by scan.
     pub steps: Vec<Step>,
+    /// All that is known of the building at the end, to be loaded again.
+    pub map_file: MapFile,
     /// The map at the end: its walls.
     pub map: Vec<MapSegment>,
     /// The same with all that is tentative, as the front end has it.
@@ -114,8 +121,30 @@ impl Replay {
     }
 }
 
+/// Where a robot begins.
+#[derive(Clone, Debug, Default)]
+pub struct Start {
+    /// In this map; else in an empty one.
+    pub map: Option<MapFile>,
+    /// At this pose in it; else it looks for itself.
+    pub pose: Option<Isometry2<f32>>,
+    /// Whether the map stays as it is.
+    pub frozen: bool,
+}
+
 /// Runs a log through the core. `progress` is called after each scan.
 pub fn run(
+    log: &Log,
+    robot: &Robot,
+    config: SlamConfig,
+    progress: impl FnMut(),
+) -> Result<Replay, ReplayError> {
+    run_from(&Start::default(), log, robot, config, progress)
+}
+
+/// The same in a map that there is already.
+pub fn run_from(
+    start: &Start,
     log: &Log,
     robot: &Robot,
     config: SlamConfig,
@@ -129,9 +158,9 @@ pub fn run(
         (config.odometry.bias, config.odometry.delay) = (None, None);
     }
     match beams {
-        ..=URG_BEAMS => run_sized::<URG_BEAMS>(log, robot, config, progress),
-        _ if beams <= MANY_BEAMS => run_sized::<MANY_BEAMS>(log, robot, config, progress),
-        _ if beams <= MOST_BEAMS => run_sized::<MOST_BEAMS>(log, robot, config, progress),
+        ..=URG_BEAMS => run_sized::<URG_BEAMS>(start, log, robot, config, progress),
+        _ if beams <= MANY_BEAMS => run_sized::<MANY_BEAMS>(start, log, robot, config, progress),
+        _ if beams <= MOST_BEAMS => run_sized::<MOST_BEAMS>(start, log, robot, config, progress),
         _ => {
             let source = ConfigError::TooManyBeams { beams, capacity: MOST_BEAMS };
             Err(ReplayError::Config { robot: robot.name.clone(), source })
@@ -140,6 +169,7 @@ pub fn run(
 }
 
 fn run_sized<const BEAMS: usize>(
+    start: &Start,
     log: &Log,
     robot: &Robot,
     config: SlamConfig,
@@ -149,10 +179,14 @@ fn run_sized<const BEAMS: usize>(
     let wheels = robot.wheels.zip(robot.drive());
     let drive = wheels.map(|(wheels, drive)| drive_of_counters(&wheels, drive));
     let mut mapper = Mapper::<MAP_SEGMENTS, TRACK, BEAMS>::new(config, drive).map_err(refused)?;
+    if let Some(map) = &start.map {
+        map.hand_to(&mut mapper, start.pose)?;
+    }
+    mapper.set_mapping(!start.frozen);
     let mut feed = OdometryFeed::new(log, robot)?;
     let delay_us = (robot.sensor.scan_delay_s * 1e6).round() as i64;
     let mut steps: Vec<Step> = Vec::with_capacity(log.scans.len());
-    let mut odometry = Isometry2::identity();
+    let mut odometry = start.pose.unwrap_or_else(Isometry2::identity);
     let mut distance_m = 0.0;
     for (k, scan) in log.scans.iter().enumerate() {
         let sensor = robot.sensor_for(&log.layout(k));
@@ -195,6 +229,7 @@ fn run_sized<const BEAMS: usize>(
     let slam = mapper.slam();
     Ok(Replay {
         steps,
+        map_file: MapFile::of(slam),
         map: slam.walls().copied().collect(),
         local_map: slam.map().segments().to_vec(),
         map_counters: slam.map().counters(),

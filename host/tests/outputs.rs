@@ -48,6 +48,7 @@ fn a_run_writes_every_file_and_the_recording_where_it_is_asked_for() {
         "log.jsonl",
         "map.csv",
         "map.dxf",
+        "map.json",
         "map.pgm",
         "map.svg",
         "map.yaml",

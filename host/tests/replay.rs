@@ -131,6 +131,7 @@ fn writes_every_file_for_a_carmen_log() {
     let expected = [
         "map.csv",
         "map.dxf",
+        "map.json",
         "map.pgm",
         "map.svg",
         "map.yaml",
@@ -724,4 +725,83 @@ fn other_units_and_separators_are_understood_when_told() {
     let output = bench.replay(&bench.file("table.dat", table.join("\n")), &[]);
     assert!(output.status.success(), "{output:?}");
     assert_eq!(bench.report()["scans_used"], 12);
+}
+
+/// A drive in the lab, and the map of its first replay.
+fn lab() -> (Bench, PathBuf, PathBuf) {
+    let bench = Bench::new();
+    let world = Path::new(env!("CARGO_MANIFEST_DIR")).join("../worlds/lab.toml");
+    let done = Command::new(env!("CARGO_BIN_EXE_lineslam"))
+        .arg("simulate")
+        .arg(world)
+        .arg("--out")
+        .arg(bench.folder.path().join("drive"))
+        .output()
+        .unwrap();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let folder = bench.folder.path().join("drive");
+    (bench, folder.join("log.jsonl"), folder.join("map.json"))
+}
+
+#[test]
+fn a_map_that_was_written_is_driven_in() {
+    let (bench, log, map) = lab();
+    let map = map.to_str().unwrap();
+    let before: serde_json::Value = serde_json::from_slice(&std::fs::read(map).unwrap()).unwrap();
+    assert_eq!((&before["format"], &before["version"]), (&"lineslam map".into(), &1.into()));
+    assert!(before["lines"].as_array().unwrap().len() > 40 && before["places"].as_array().unwrap().len() > 5);
+    // Somewhere in it, the map as it is: found, and the pose that of the first run.
+    let found = bench.replay(&log, &["--map", map, "--localise"]);
+    assert!(found.status.success(), "{}", String::from_utf8_lossy(&found.stderr));
+    assert_eq!(bench.report()["tracking"]["relocalised"], 1);
+    let ends = bench.lines("trajectory.tum").pop().unwrap();
+    let now: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(bench.out().join("map.json")).unwrap()).unwrap();
+    assert_eq!(
+        (&now["lines"].as_array().unwrap().len(), &now["places"]),
+        (&before["lines"].as_array().unwrap().len(), &before["places"])
+    );
+    // The same from a pose that was told.
+    assert!(bench.replay(&log, &["--map", map, "--localise", "--start", "0,0,0"]).status.success());
+    assert_eq!(bench.report()["tracking"]["lost"], 0);
+    let told = bench.lines("trajectory.tum").pop().unwrap();
+    let xy =
+        |line: &str| -> Vec<f64> { line.split(' ').skip(1).take(2).map(|v| v.parse().unwrap()).collect() };
+    let off = xy(&ends).iter().zip(xy(&told)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(off < 0.05, "{ends} {told}");
+    // And going on to map.
+    assert!(bench.replay(&log, &["--map", map, "--start=0,0,0"]).status.success());
+    let after: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(bench.out().join("map.json")).unwrap()).unwrap();
+    assert!(after["way_m"].as_f64().unwrap() > 1.9 * before["way_m"].as_f64().unwrap());
+}
+
+#[test]
+fn maps_that_are_none_are_refused() {
+    let bench = Bench::new();
+    let log = bench.file("log.carmen", carmen_log(20).join("\n"));
+    let whole = r#"{"format":"lineslam map","version":1,"way_m":0,"odometry_bias":[0,0,0],"lines":[LINE],"places":[],"loops":[]}"#;
+    let line = r#"{"start_m":[0,0],"end_m":[1,0],"middle_m":0.5,"sigma_offset_m":0.01,"sigma_direction_rad":0.01,"points":9,"hits":9,"seen_at_m":0}"#;
+    let good = whole.replace("LINE", line);
+    for (content, words) in [
+        (good.replace("lineslam map", "another map"), &["map.json", "not a lineslam map", "another map"][..]),
+        (good.replace("\"version\":1", "\"version\":7"), &["map.json", "version 7", "version 1"]),
+        (good.replace("\"end_m\":[1,0]", "\"end_m\":[0,0]"), &["map.json", "lines[0]", "makes no sense"]),
+        (good.replace("\"hits\":9,", ""), &["map.json", "hits", "line 1"]),
+        (good.replace("\"points\"", "\"dots\""), &["map.json", "dots"]),
+        (good.replace("]}", ""), &["map.json", "EOF"]),
+        (String::new(), &["map.json", "EOF"]),
+        (whole.replace("LINE", &[line; 513].join(",")), &["map.json", "513 lines", "512"]),
+    ] {
+        let map = bench.file("map.json", content);
+        bench.refuses(&log, &["--map", map.to_str().unwrap()], words);
+    }
+    let map = bench.file("map.json", good);
+    let map = map.to_str().unwrap();
+    bench.refuses(&log, &["--map", "missing.json"], &["missing.json", "No such file"]);
+    bench.refuses(&log, &["--map", map, "--config", "paper"], &["--map", "--config paper"]);
+    bench.refuses(&log, &["--map", map, "--start", "1,2"], &["--start", "2 numbers", "X,Y,DEG"]);
+    bench.refuses(&log, &["--map", map, "--start", "1,2,north"], &["--start", "1.5,-2,90"]);
+    bench.refuses(&log, &["--localise"], &["--map"]);
+    assert!(bench.replay(&log, &["--map", map, "--start", "-1,-2,-90"]).status.success());
 }

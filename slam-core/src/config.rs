@@ -249,7 +249,7 @@ impl Default for SlamConfig {
             state: STATE,
             relocalisation: Some(RelocalisationConfig {
                 places_per_scan: 1,
-                guesses_per_scan: 12,
+                guesses_per_scan: 10,
                 least_segments: 3,
                 least_support: 0.45,
                 min_support: 0.6,

@@ -10,6 +10,7 @@ use nalgebra::{Isometry2, Matrix3, Vector3};
 
 use crate::config::{ConfigError, SlamConfig};
 use crate::geometry::pose::turn;
+use crate::map::store::{MapError, StoredMap};
 use crate::odometry::delay::{Delay, DelayEstimator, RATE_WITHIN_US};
 use crate::odometry::track::{OdometryTrack, ScanMotion};
 use crate::odometry::{DifferentialDrive, Increment};
@@ -131,6 +132,21 @@ impl<const N: usize, const K: usize, const BEAMS: usize, const P: usize> Mapper<
     /// Takes another scanner, see [`Slam::set_sensor`].
     pub fn set_sensor(&mut self, sensor: SensorConfig) -> Result<(), ConfigError> {
         self.slam.set_sensor(sensor)
+    }
+
+    /// Takes a saved map, see [`Slam::load`].
+    pub fn load(&mut self, map: &StoredMap<'_>, at: Option<Isometry2<f32>>) -> Result<(), MapError> {
+        self.slam.load(map, at)
+    }
+
+    /// Freezes the map, or lets it learn again, see [`Slam::set_mapping`].
+    pub fn set_mapping(&mut self, mapping: bool) {
+        self.slam.set_mapping(mapping);
+    }
+
+    /// The robot may be anywhere in its map, see [`Slam::relocalise`].
+    pub fn relocalise(&mut self) {
+        self.slam.relocalise();
     }
 
     /// Map, pose and counters.

@@ -267,9 +267,8 @@ impl Relocaliser {
 
     fn judge(&self, config: &RelocalisationConfig) -> Relocalisation {
         let best = self.guesses.iter().max_by(|a, b| a.support.total_cmp(&b.support)).copied();
-        let is_rival = |guess: &&Guess| {
-            guess.scans >= RIVAL_SCANS && best.is_some_and(|best| !best.is_same(guess))
-        };
+        let is_rival =
+            |guess: &&Guess| guess.scans >= RIVAL_SCANS && best.is_some_and(|best| !best.is_same(guess));
         let runner_up = self.guesses.iter().filter(is_rival).map(|g| g.support).fold(0.0, max);
         let explains = best.is_some_and(|best| best.support >= config.min_support);
         let verdict = match best {

@@ -3,6 +3,7 @@
 mod access;
 mod recovery;
 mod relocation;
+mod saved;
 
 use nalgebra::Isometry2;
 
@@ -36,6 +37,8 @@ pub struct Slam<const N: usize, const BEAMS: usize = 682, const P: usize = 96> {
     odometry: OdometryHealth,
     state: StateMonitor,
     relocaliser: Relocaliser,
+    /// Whether the map learns.
+    mapping: bool,
     counters: Counters,
 }
 
@@ -72,9 +75,11 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             }
             self.monitor_odometry(&by_odometry, &previous, &mut update);
             self.judge_state(scan, &motion.since_previous, &mut update);
-            self.register(&mut update, watch);
-            self.forget(scan, &update);
-            self.keep_places(&by_odometry, &mut update);
+            if self.mapping {
+                self.register(&mut update, watch);
+                self.forget(scan, &update);
+                self.keep_places(&by_odometry, &mut update);
+            }
         } else {
             self.places.pass_blindly(&by_odometry);
         }
@@ -98,7 +103,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         let (estimator, mut around) = self.estimator();
         let is_usable = estimator.predict(motion, &mut around);
         self.counters.count_motion(is_usable);
-        if self.estimator.is_way_long() {
+        if self.mapping && self.estimator.is_way_long() {
             // Between the commit of one keyframe's update and the next keyframe.
             let Self { config, estimator, tracker, map, .. } = self;
             estimator.open_lines(config, tracker.nearby.all(), None, map);
@@ -242,6 +247,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
                 let mut around =
                     Surroundings { config, odometry, observed: frontend.segments(), map, tracker };
                 estimator.carry(&closure.moved, places, &mut around);
+                places.moved_all();
                 odometry.map_moved();
                 update.predicted = closure.moved * update.predicted;
                 break;

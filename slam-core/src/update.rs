@@ -10,9 +10,9 @@ use crate::odometry::wheel_faults::WheelFault;
 use crate::places::Closure;
 use crate::relocalisation::{Relocalisation, Verdict};
 use crate::sensor::scan::{Scan, ScanGeometry};
-use crate::tracking::{Hypothesis, TrackingState};
 use crate::tracking::correction::{Observability, Prior};
 use crate::tracking::tracker::Tracked;
+use crate::tracking::{Hypothesis, TrackingState};
 
 /// What happened since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -4,6 +4,7 @@
 
 use nalgebra::{Isometry2, Point2, Vector2};
 use slam_core::geometry::pose::pose;
+use slam_core::map::store::{StoredLine, StoredLoop, StoredMap, StoredPlace};
 use slam_core::odometry::Increment;
 use slam_core::relocalisation::Verdict;
 use slam_core::tracking::TrackingState;
@@ -167,7 +168,7 @@ fn where_nothing_has_been_mapped_it_goes_on_in_the_end() {
         updates.extend(drive.to(5.0, 50.7));
         updates.extend(drive.to(1.0, 50.7));
     }
-    let last = updates.iter().filter_map(|u| u.relocalisation).last().expect("it was lost");
+    let last = updates.iter().rev().find_map(|u| u.relocalisation).expect("it was lost");
     assert_eq!((last.verdict, found(&updates)), (Verdict::GivenUp, None));
     assert!(drive.slam.state() != TrackingState::Lost);
 }
@@ -186,4 +187,76 @@ fn a_robot_that_may_be_anywhere_asks_to_be_found() {
     let mut paper = Slam::<64>::new(SlamConfig::paper()).unwrap();
     paper.relocalise();
     assert_eq!(paper.state(), TrackingState::Tracking);
+}
+
+/// A map as it was saved.
+fn stored(slam: &Slam<128>) -> (Vec<StoredLine>, Vec<StoredPlace>, Vec<StoredLoop>) {
+    (slam.stored_lines().collect(), slam.stored_places().collect(), slam.stored_loops().collect())
+}
+
+#[test]
+fn a_saved_map_is_driven_in_and_goes_on() {
+    let mut first = Drive::new(room(0.0, 0.0), pose(1.0, 1.0, 0.0));
+    for (x, y) in [(3.5, 1.0), (3.5, 3.0), (1.5, 3.0), (1.5, 1.0), (3.5, 1.0)] {
+        first.to(x, y);
+    }
+    let (lines, places, loops) = stored(&first.slam);
+    let map = StoredMap {
+        lines: &lines,
+        places: &places,
+        loops: &loops,
+        way_m: first.slam.way_m(),
+        odometry_bias: first.slam.odometry_bias(),
+    };
+    let begin = pose(3.2, 2.6, 2.0);
+    for (known, mapping) in [(false, false), (true, false), (true, true), (false, true)] {
+        let mut drive = Drive::new(room(0.0, 0.0), pose(1.0, 1.0, 0.0));
+        drive.truth = begin;
+        let at = drive.start.inv_mul(&begin);
+        drive.slam.load(&map, known.then_some(at)).unwrap();
+        drive.slam.set_mapping(mapping);
+        let before = drive.slam.map().segments().to_vec();
+        assert_eq!((drive.slam.state() == TrackingState::Lost, drive.slam.is_mapping()), (!known, mapping));
+        let updates = [drive.to(1.5, 3.0), drive.to(1.5, 1.0), drive.to(3.5, 1.2)].concat();
+        assert_eq!(found(&updates).is_some(), !known);
+        assert_eq!(drive.slam.state(), TrackingState::Tracking);
+        let (off_m, off_rad) = drive.off();
+        assert!(off_m < 0.05 && off_rad < 0.03, "{known} {mapping}: {off_m} {off_rad}");
+        assert_eq!(drive.slam.map().segments() == before, !mapping, "{known}");
+        assert!(drive.slam.way_m() > map.way_m + 3.0);
+    }
+}
+
+#[test]
+fn a_map_that_cannot_be_used_changes_nothing() {
+    let mut drive = Drive::new(room(0.0, 0.0), pose(1.0, 1.0, 0.0));
+    for (x, y) in [(3.5, 1.0), (3.5, 3.0), (1.5, 3.0)] {
+        drive.to(x, y);
+    }
+    let (lines, places, loops) = stored(&drive.slam);
+    let whole = StoredMap {
+        lines: &lines,
+        places: &places,
+        loops: &loops,
+        way_m: 9.0,
+        odometry_bias: drive.slam.odometry_bias(),
+    };
+    let mut bad_lines = lines.clone();
+    bad_lines[1].end_m = bad_lines[1].start_m;
+    let mut bad_places = places.clone();
+    bad_places[0].way_m = f32::NAN;
+    let many = vec![lines[0]; 129];
+    let edge = StoredLoop { from: 0, to: 99, measured: [0.0; 3], covariance: [1.0, 0.0, 0.0, 1.0, 0.0, 1.0] };
+    let before = (drive.slam.map().segments().to_vec(), drive.slam.pose());
+    for (map, says) in [
+        (StoredMap { lines: &bad_lines, ..whole }, "lines[1] has a number that makes no sense"),
+        (StoredMap { places: &bad_places, ..whole }, "places[0] has a number that makes no sense"),
+        (StoredMap { loops: &[edge], ..whole }, "loops[0] has a number that makes no sense"),
+        (StoredMap { lines: &many, ..whole }, "the map has 129 lines, there is room for 128"),
+        (StoredMap { way_m: f32::INFINITY, ..whole }, "way_m or odometry_bias is no number"),
+    ] {
+        assert_eq!(drive.slam.load(&map, None).unwrap_err().to_string(), says);
+    }
+    assert_eq!((drive.slam.map().segments().to_vec(), drive.slam.pose()), before);
+    assert_eq!(drive.slam.state(), TrackingState::Tracking);
 }

@@ -12,7 +12,7 @@ use lineslam::output::grid::Grid;
 use lineslam::output::report::Report;
 use lineslam::output::svg::{Picture, Scene};
 use lineslam::output::{self, csv, dxf, mcap, svg, trajectory_csv, tum};
-use lineslam::replay::{self, Replay, ReplayError};
+use lineslam::replay::{self, Replay, ReplayError, Start};
 use lineslam::robot::Robot;
 
 /// Writes a single file, whole or not at all.
@@ -22,9 +22,14 @@ pub fn write_one(path: &Path, text: String) -> anyhow::Result<()> {
     Ok(output::write_all(folder, &[(name, text.into_bytes())])?)
 }
 
-pub fn run(log: &Log, robot: &Robot, configuration: Configuration) -> Result<Replay, ReplayError> {
+pub fn run(
+    start: &Start,
+    log: &Log,
+    robot: &Robot,
+    configuration: Configuration,
+) -> Result<Replay, ReplayError> {
     let progress = progress_bar(log.scans.len(), "scans");
-    let result = replay::run(log, robot, configuration.config(), || progress.inc(1))?;
+    let result = replay::run_from(start, log, robot, configuration.config(), || progress.inc(1))?;
     progress.finish_and_clear();
     Ok(result)
 }
@@ -45,6 +50,7 @@ pub fn results(
         ("trajectory.csv", trajectory_csv::render(&result.steps).context("trajectory.csv")?),
         ("odometry.tum", tum::render(replay::dead_reckoning(&result.steps)).into_bytes()),
         ("map.csv", csv::render(&result.map).context("map.csv")?),
+        ("map.json", result.map_file.render().context("map.json")?),
         ("map.svg", svg::render(&Picture::of(log, result), scene).into_bytes()),
         ("map.dxf", dxf::render(&result.map, path).context("map.dxf")?),
         ("map.pgm", grid.pgm().context("map.pgm")?),

@@ -2,10 +2,14 @@
 
 use std::path::PathBuf;
 
+use lineslam::map_file::{MapFile, MapFileError};
 use lineslam::output;
 use lineslam::output::report::Report;
 use lineslam::output::svg::Scene;
+use lineslam::replay::Start;
 use lineslam::robot::Robot;
+use nalgebra::Isometry2;
+use slam_core::geometry::pose::pose;
 
 use super::common::{self, Configuration, print_summary, results};
 use super::log_args::{LogArgs, warn};
@@ -21,8 +25,17 @@ pub struct Args {
     /// Which algorithm.
     #[arg(long, value_enum, default_value_t = Configuration::Default)]
     config: Configuration,
-    /// Folder for trajectory.tum and .csv, trajectory_final.tum, odometry.tum, map.csv, map.svg, map.dxf, map.pgm with
-    /// map.yaml, and report.json.
+    /// Begin in this map, a map.json of an earlier replay, and go on mapping. Where the robot stands in it is looked for.
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
+    /// Only find the way in the map: it stays as it is.
+    #[arg(long, requires = "map")]
+    localise: bool,
+    /// Where the robot stands in the map: x and y in metres, heading in degrees.
+    #[arg(long, value_name = "X,Y,DEG", requires = "map", allow_hyphen_values = true, value_parser = start_pose)]
+    start: Option<Isometry2<f32>>,
+    /// Folder for trajectory.tum and .csv, trajectory_final.tum, odometry.tum, map.csv, map.json, map.svg, map.dxf, map.pgm
+    /// with map.yaml, and report.json.
     #[arg(long, value_name = "FOLDER", default_value = "out")]
     out: PathBuf,
     /// Also record the run as ROS 2 messages in this MCAP file, for ros2 bag play, RViz and Foxglove.
@@ -30,14 +43,32 @@ pub struct Args {
     mcap: Option<PathBuf>,
 }
 
+/// Three numbers with commas between them.
+fn start_pose(text: &str) -> Result<Isometry2<f32>, String> {
+    let numbers: Vec<f32> = text
+        .split(',')
+        .map(|word| word.trim().parse().ok().filter(|v: &f32| v.is_finite()))
+        .collect::<Option<_>>()
+        .ok_or("expected three numbers, as 1.5,-2,90")?;
+    match numbers[..] {
+        [x, y, deg] => Ok(pose(x, y, deg.to_radians())),
+        _ => Err(format!("{} numbers where X,Y,DEG are expected", numbers.len())),
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    let map = args.map.as_deref().map(MapFile::load).transpose()?;
+    if map.is_some() && args.config != Configuration::Default {
+        return Err(MapFileError::Configuration(args.config.name()).into());
+    }
+    let start = Start { map, pose: args.start, frozen: args.localise };
     // A given robot file is checked first: its beams are what the log must have.
     let given = args.robot.as_deref().map(Robot::load).transpose()?;
     let wheels = given.as_ref().is_some_and(|robot| robot.wheels.is_some());
     let log = args.log.read(given.as_ref(), wheels)?;
     let robot = given.unwrap_or_else(|| log.usual_robot());
     warn(&log.warnings);
-    let result = common::run(&log, &robot, args.config)?;
+    let result = common::run(&start, &log, &robot, args.config)?;
     let report = Report::new(&log, &robot, args.config.name(), &result);
     warn(report.warnings.get(log.warnings.len()..).unwrap_or_default());
     let path = &args.log.log;

@@ -6,6 +6,7 @@ use lineslam::log;
 use lineslam::output::report::{Report, SimulationReport};
 use lineslam::output::svg::Scene;
 use lineslam::output::{self, tum};
+use lineslam::replay::Start;
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
 use lineslam::sim::{self, SimConfig, SimKind, judge};
@@ -72,7 +73,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         errors.set(setting)?;
     }
     let drive = sim::drive(&world, &robot, &errors, args.seed)?;
-    let result = super::common::run(&drive.log, &robot, args.config)?;
+    let result = super::common::run(&Start::default(), &drive.log, &robot, args.config)?;
     let mut report = Report::new(&drive.log, &robot, args.config.name(), &result);
     report.simulation = Some(SimulationReport::new(&world, &drive, &result, args.seed, errors));
     let caption = format!("{}, seed {}", world.name, args.seed);

@@ -120,7 +120,7 @@ pub(super) fn run(options: &Options, progress: impl Fn() + Sync) -> Result<Vec<K
 }
 
 /// One drive, of the real kind.
-fn lifted(
+pub fn lifted(
     name: &'static str,
     world: &World,
     at_s: f64,

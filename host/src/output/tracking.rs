@@ -66,7 +66,8 @@ impl Tracking {
             bad => format!("{bad} of {scans}"),
         };
         if self.relocalised > 0 {
-            let times = if self.relocalised == 1 { "once".into() } else { format!("{} times", self.relocalised) };
+            let times =
+                if self.relocalised == 1 { "once".into() } else { format!("{} times", self.relocalised) };
             line += &format!("; found itself {times}");
         }
         let odometry = parts(&[(self.odometry_left_out, "left out"), (self.odometry_useless, "useless")]);

@@ -88,7 +88,6 @@ impl EkfSlam {
     }
 
     /// Sets them.
-    #[cfg(test)]
     pub(crate) fn set_bias(&mut self, bias: OdometryBias) {
         self.bias = bias;
     }

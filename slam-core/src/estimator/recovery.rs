@@ -7,7 +7,8 @@ use crate::config::SlamConfig;
 use crate::ekf::keyframe::{Keyframe, LocalVariance};
 use crate::geometry::pose::{is_finite, normalized};
 use crate::map::SegmentMap;
-use crate::tracking::Hypothesis;
+use crate::map::store::StoredMap;
+use crate::tracking::correction::Prior;
 
 impl Estimator {
     /// Begins anew at a pose that is taken as certain.
@@ -18,8 +19,17 @@ impl Estimator {
         self.begin_anew(config);
     }
 
-    /// Begins anew where the robot was found in its map.
-    pub fn relocate<const N: usize>(&mut self, at: &Hypothesis, config: &SlamConfig, map: &mut SegmentMap<N>) {
+    /// Begins anew in a map that was saved, at a pose that is taken as certain.
+    pub fn begin_in(&mut self, saved: &StoredMap<'_>, map_from_base: Isometry2<f32>, config: &SlamConfig) {
+        if let Some(filter) = &mut self.filter {
+            filter.set_bias(saved.odometry_bias);
+        }
+        self.travelled_m = saved.way_m;
+        self.begin_at(map_from_base, config);
+    }
+
+    /// Begins anew at a pose with a covariance.
+    pub fn restart<const N: usize>(&mut self, at: &Prior, config: &SlamConfig, map: &mut SegmentMap<N>) {
         (self.map_from_base, self.local_covariance) = (at.pose, at.covariance);
         self.restart_way();
         self.begin_anew(config);

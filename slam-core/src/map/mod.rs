@@ -7,6 +7,7 @@
 pub(crate) mod fixtures;
 pub mod nearby;
 pub mod openings;
+pub mod store;
 pub mod visibility;
 pub mod walls;
 
@@ -92,11 +93,10 @@ impl<const N: usize> SegmentMap<N> {
     }
 
     /// Begins anew with these segments, which have not been seen yet by any scan to come.
-    pub(crate) fn take_up(&mut self, segments: &[MapSegment]) {
+    pub(crate) fn take_up(&mut self, segments: impl Iterator<Item = MapSegment>) {
         self.segments.clear();
         for entry in segments {
-            if !entry.segment.is_finite()
-                || self.segments.push(MapSegment { last_seen: 0, seen_at_m: 0.0, ..*entry }).is_err()
+            if !entry.segment.is_finite() || self.segments.push(MapSegment { last_seen: 0, ..entry }).is_err()
             {
                 self.counters.refused = self.counters.refused.saturating_add(1);
             }

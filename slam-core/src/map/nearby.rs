@@ -10,6 +10,8 @@ use crate::map::MapSegment;
 
 /// Sectors of direction. Each is at least [`NARROWEST_RAD`] wide.
 const SECTORS: usize = 12;
+/// Of a segment that is not nearby.
+const NO_SECTOR: u8 = SECTORS as u8;
 /// Width of the narrowest sector, radians: atan 1/2, less a little for rounding.
 const NARROWEST_RAD: f32 = 0.46;
 
@@ -34,7 +36,7 @@ impl<const N: usize> Nearby<N> {
         Self { indices: Vec::new(), ends: [0; SECTORS] }
     }
 
-    /// Finds the segments within `reach_m` of the pose that `counts` holds for. Work: two steps for each map segment.
+    /// Finds the segments within `reach_m` of the pose that `counts` holds for. Work: a step for each map segment, and one for each found.
     pub fn gather(
         &mut self,
         map: &[MapSegment],
@@ -47,10 +49,13 @@ impl<const N: usize> Nearby<N> {
             let radius = reach_m + 0.5 * entry.segment.length_m();
             to_middle.norm_squared() <= radius * radius && counts(entry)
         };
-        // A counting sort: how many of each sector, where each begins, then each to its place.
+        // A counting sort: the sector of each and how many there are of it, where each sector begins, then each to its place.
+        let mut sectors = [NO_SECTOR; N];
         self.ends = [0; SECTORS];
-        for entry in map.iter().filter(|entry| near(entry)) {
-            if let Some(count) = self.ends.get_mut(sector(entry.segment.direction)) {
+        for (own, entry) in sectors.iter_mut().zip(map).filter(|(_, entry)| near(entry)) {
+            let sector = sector(entry.segment.direction);
+            if let Some(count) = self.ends.get_mut(sector) {
+                *own = sector as u8;
                 *count += 1;
             }
         }
@@ -61,8 +66,8 @@ impl<const N: usize> Nearby<N> {
         self.indices.clear();
         // At most as many as the map holds, which is the capacity.
         let _ = self.indices.resize(usize::from(begin), 0);
-        for (index, entry) in map.iter().enumerate().filter(|(_, entry)| near(entry)) {
-            let Some(end) = self.ends.get_mut(sector(entry.segment.direction)) else { continue };
+        for (index, sector) in sectors.iter().enumerate() {
+            let Some(end) = self.ends.get_mut(usize::from(*sector)) else { continue };
             if let Some(place) = self.indices.get_mut(usize::from(*end)) {
                 *place = index as u16;
             }

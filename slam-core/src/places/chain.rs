@@ -16,15 +16,15 @@ use crate::tracking::correction::Verdict;
 #[derive(Clone, Debug)]
 pub struct Anchor {
     /// Pose in `map`, as corrected by now.
-    pub(super) pose: Isometry2<f32>,
+    pub(crate) pose: Isometry2<f32>,
     /// From the anchor before, as the front end drove.
-    pub(super) from_previous: Isometry2<f32>,
+    pub(crate) from_previous: Isometry2<f32>,
     /// Variances of that motion (along m², across m², heading rad²) in the frame of this anchor.
-    pub(super) variances: [f32; 3],
+    pub(crate) variances: [f32; 3],
     /// Way driven until here, metres.
-    pub(super) way_m: f32,
+    pub(crate) way_m: f32,
     /// Its lines.
-    pub(super) lines: PlaceLines,
+    pub(crate) lines: PlaceLines,
 }
 
 impl Anchor {
@@ -136,6 +136,11 @@ impl<const P: usize> Chain<P> {
             self.anchors.last().map_or_else(Isometry2::identity, |last| last.pose.inv_mul(&pose));
         let lines = PlaceLines::default();
         self.anchors.push(Anchor { pose, from_previous, variances, way_m, lines }).is_ok()
+    }
+
+    /// Adds an anchor as it was.
+    pub(super) fn restore(&mut self, anchor: Anchor) -> bool {
+        self.anchors.push(anchor).is_ok()
     }
 
     /// The least informative anchor of those in the inside of the chain that are not `needed`: the one between the two that lie closest

@@ -15,7 +15,7 @@ use super::lines::unpacked;
 use super::matching::{Gate, Match, matched};
 use super::solver::{Loop, Solver};
 use super::twist::{Packed, inverse_adjoint};
-use crate::geometry::math::sqrt;
+use crate::geometry::math::{sort_few, sqrt};
 use crate::geometry::pose::components;
 
 /// Old places looked at for each new one.
@@ -252,7 +252,7 @@ impl Finder {
             let _ = self.candidates.push(Candidate { place, spread, rank });
         }
         if is_last {
-            self.candidates.sort_unstable_by(|a, b| b.rank.total_cmp(&a.rank));
+            sort_few(&mut self.candidates, |candidate| -candidate.rank);
         } else {
             query.next = Some((after, Packed::of(&sum)));
         }
@@ -278,7 +278,7 @@ impl Finder {
         }
         let mut order: Vec<u8, PENDING> = (0..self.pending.len() as u8).collect();
         let share = |k: &u8| self.pending.get(usize::from(*k)).map_or(0.0, |p| p.share);
-        order.sort_unstable_by(|a, b| share(b).total_cmp(&share(a)));
+        sort_few(&mut order, |k| -share(k));
         let mut judged = 0;
         let mut least_informative = None;
         for k in order {

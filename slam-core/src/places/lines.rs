@@ -5,7 +5,7 @@
 use heapless::Vec;
 use nalgebra::{Isometry2, Point2, Vector2};
 
-use crate::geometry::math::{atan2, max, min, sqrt};
+use crate::geometry::math::{atan2, max, min, sort_few, sqrt};
 use crate::geometry::pose::{cross, perpendicular};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
@@ -44,6 +44,16 @@ impl PlaceLine {
             *slot = (mm + if mm < 0.0 { -0.5 } else { 0.5 }) as i16;
         }
         Some(Self(ends))
+    }
+
+    /// x and y of both ends, millimetres.
+    pub(crate) fn numbers(&self) -> [i16; 4] {
+        self.0
+    }
+
+    /// The same from them.
+    pub(crate) fn from_numbers(numbers: [i16; 4]) -> Self {
+        Self(numbers)
     }
 
     /// Both ends, metres.
@@ -107,7 +117,7 @@ pub(super) fn around(map: &[MapSegment], at: &Isometry2<f32>, reach_m: f32) -> V
     let place_from_map = at.inverse();
     let in_place = |segment: &&Segment| ray(place_from_map * segment.start, place_from_map * segment.end);
     let mut rays: Vec<Ray, AROUND> = longest.iter().filter_map(in_place).collect();
-    rays.sort_unstable_by(|a, b| a.angle_rad.total_cmp(&b.angle_rad));
+    sort_few(&mut rays, |ray| ray.angle_rad);
     rays
 }
 
@@ -135,7 +145,7 @@ fn longest<'a, const N: usize>(segments: impl Iterator<Item = &'a Segment>) -> V
 pub(crate) fn of_scan(observed: &[Segment]) -> Vec<Ray, PLACE_LINES> {
     let mut rays: Vec<Ray, PLACE_LINES> =
         longest::<PLACE_LINES>(observed.iter()).iter().filter_map(|s| ray(s.start, s.end)).collect();
-    rays.sort_unstable_by(|a, b| b.length_m.total_cmp(&a.length_m));
+    sort_few(&mut rays, |ray| -ray.length_m);
     rays
 }
 

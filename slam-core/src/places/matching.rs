@@ -12,7 +12,7 @@ use heapless::Vec;
 use nalgebra::{Isometry2, Matrix3, Point2, Vector2, Vector3};
 
 use super::lines::Ray;
-use crate::geometry::math::{max, min, sqrt, within, wrap_angle};
+use crate::geometry::math::{max, min, sort_few, sqrt, within, wrap_angle};
 use crate::geometry::pose::{components, cross, heading, pose};
 
 /// Lines at a smaller angle fix no pose together, as a sine.
@@ -125,7 +125,7 @@ struct Cell {
 pub(super) fn matched(query: &[Ray], place: &[Ray], gate: &Gate) -> Option<Match> {
     let mut cells: Vec<Cell, CELLS> = Vec::new();
     propose(query, place, gate, &mut cells);
-    cells.sort_unstable_by(|a, b| b.weight.total_cmp(&a.weight));
+    sort_few(&mut cells, |cell| -cell.weight);
     let mut found: Vec<Match, REFINED> = Vec::new();
     for cell in cells.iter().take(REFINED) {
         let mean = cell.sum / cell.weight;

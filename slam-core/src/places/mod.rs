@@ -26,6 +26,7 @@ use crate::config::{Checked, not_negative};
 use crate::geometry::math::within;
 use crate::geometry::pose::{heading, normalized, pose, turn};
 use crate::map::MapSegment;
+use crate::map::store::{StoredLoop, StoredPlace};
 use crate::map::walls::WallConfig;
 use crate::odometry::Increment;
 use crate::tracking::correction::Verdict;
@@ -33,8 +34,8 @@ use chain::Support;
 pub use chain::{Anchor, Chain};
 pub use factor::LOOPS;
 use finding::{Finder, Known};
-pub(crate) use lines::{Ray, of_scan};
 pub use lines::{PLACE_LINES, PlaceLine};
+pub(crate) use lines::{Ray, of_scan};
 pub use solver::Loop;
 use solver::{Progress, Solver};
 
@@ -147,6 +148,8 @@ pub struct Places<const P: usize> {
     without_lines: u8,
     /// The last scan was a keyframe that left no step.
     rested: bool,
+    /// A solution is being swapped in, and what was seen moves with it.
+    is_moving: bool,
 }
 
 impl<const P: usize> Places<P> {
@@ -168,6 +171,7 @@ impl<const P: usize> Places<P> {
             is_stale: false,
             without_lines: 0,
             rested: false,
+            is_moving: false,
         }
     }
 
@@ -178,6 +182,47 @@ impl<const P: usize> Places<P> {
         self.solver.clear();
         self.finder = Finder::new();
         (self.support, self.is_stale, self.without_lines) = (Support::NONE, false, 0);
+        self.is_moving = false;
+    }
+
+    /// Puts in order what a reset may have left half done. Where places were moving, or one was half written, all are forgotten: the map
+    /// is whole without them.
+    pub(crate) fn recover(&mut self) {
+        let anchors = self.chain.anchors();
+        let is_whole = |anchor: &Anchor| StoredPlace::of(anchor).anchor().is_some();
+        let in_order = anchors.is_sorted_by(|before, after| before.way_m < after.way_m);
+        let loops = self.loops.iter().all(|edge| StoredLoop::of(edge).edge(anchors.len()).is_some());
+        if self.is_moving || !in_order || !loops || !anchors.iter().all(is_whole) {
+            self.clear();
+            return;
+        }
+        self.solver.clear();
+        self.finder = Finder::new();
+        (self.is_stale, self.without_lines) = (!self.loops.is_empty(), 0);
+        self.pass_lost();
+    }
+
+    /// All that was to move with a [`Closure`] has.
+    pub(crate) fn moved_all(&mut self) {
+        self.is_moving = false;
+    }
+
+    /// Takes places and loops as they were. False where there is no room, and then there are none.
+    pub(crate) fn restore(
+        &mut self,
+        anchors: impl Iterator<Item = Anchor>,
+        loops: impl Iterator<Item = Loop>,
+    ) -> bool {
+        self.clear();
+        let mut fits = true;
+        anchors.for_each(|anchor| fits &= self.chain.restore(anchor));
+        loops.for_each(|edge| fits &= self.loops.push(edge).is_ok());
+        if !fits {
+            self.clear();
+        }
+        // The posterior is that of a solution.
+        self.is_stale = !self.loops.is_empty();
+        fits
     }
 
     /// The places.
@@ -309,9 +354,15 @@ impl<const P: usize> Places<P> {
                 None
             }
             Progress::Done => {
+                self.is_moving = true;
                 self.solver.swap_in(&mut self.chain);
                 self.finder.begin_anew(&self.chain);
-                let (old, new) = (self.solver.replaced().last()?, self.chain.anchors.last()?.pose);
+                let (Some(old), Some(last)) = (self.solver.replaced().last(), self.chain.anchors.last())
+                else {
+                    self.is_moving = false;
+                    return None;
+                };
+                let new = last.pose;
                 Some(Closure { moved: normalized(&(new * old.inverse())) })
             }
         }
@@ -319,7 +370,9 @@ impl<const P: usize> Places<P> {
 
     /// Whether the robot has been so close to a point that it would have seen what stands there.
     pub(crate) fn know(&self, point: Point2<f32>) -> bool {
-        let is_near = |anchor: &Anchor| (anchor.pose.translation.vector - point.coords).norm_squared() < KNOWN_M * KNOWN_M;
+        let is_near = |anchor: &Anchor| {
+            (anchor.pose.translation.vector - point.coords).norm_squared() < KNOWN_M * KNOWN_M
+        };
         self.chain.anchors().iter().any(is_near)
     }
 
@@ -336,7 +389,8 @@ impl<const P: usize> Places<P> {
     ) -> impl Iterator<Item = Isometry2<f32>> {
         let anchor = self.chain.get(place);
         let pose = anchor.map_or_else(Isometry2::identity, Anchor::pose);
-        let found = anchor.map(|anchor| matching::anywhere(seen, &lines::around(map, &anchor.pose, reach_m + BESIDE_M)));
+        let found = anchor
+            .map(|anchor| matching::anywhere(seen, &lines::around(map, &anchor.pose, reach_m + BESIDE_M)));
         found.into_iter().flatten().map(move |found| normalized(&(pose * found)))
     }
 

@@ -176,3 +176,30 @@ fn size_is_what_the_documentation_says() {
     let bytes = Places::<96>::BYTES;
     assert!(bytes <= 172 * 96 + 10 * 1024, "{bytes}");
 }
+
+#[test]
+fn a_reset_keeps_places_that_are_whole() {
+    let building = building(40.0, 20.0);
+    let mut drive = Drive::new();
+    let drift = Vector3::new(0.0004, 0.0, 0.00006);
+    (0..1000).for_each(|k| drive.go(along(0.15 * k as f32, 40.0, 20.0), drift, &building));
+    let (places, loops) = (drive.places.anchors().len(), drive.places.loops().len());
+    assert!(loops > 1);
+    drive.places.moved_all();
+    let whole = drive.places.clone();
+    drive.places.recover();
+    assert_eq!((drive.places.anchors().len(), drive.places.loops().len()), (places, loops));
+    (1000..1400).for_each(|k| drive.go(along(0.15 * k as f32, 40.0, 20.0), drift, &building));
+    assert!((drive.estimate.translation.vector - drive.truth.translation.vector).norm() < 0.3);
+    // Two of the same, as a reset in the middle of a removal leaves them; a number that is none; a reset while places move.
+    let twice = |places: &mut Places<96>| places.chain.anchors[4] = places.chain.anchors[5].clone();
+    let none = |places: &mut Places<96>| places.chain.anchors[4].pose.translation.x = f32::NAN;
+    let edge = |places: &mut Places<96>| places.loops[0].to = 500;
+    let moving = |places: &mut Places<96>| places.is_moving = true;
+    for harm in [&twice as &dyn Fn(&mut Places<96>), &none, &edge, &moving] {
+        let mut places = whole.clone();
+        harm(&mut places);
+        places.recover();
+        assert!(places.anchors().is_empty() && places.loops().is_empty());
+    }
+}

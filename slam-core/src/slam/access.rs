@@ -72,6 +72,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
             odometry: OdometryHealth::new(config.line_noise, config.odometry.noise),
             state: StateMonitor::default(),
             relocaliser: Relocaliser::new(),
+            mapping: true,
             counters: Counters::default(),
         }
     }

@@ -20,7 +20,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Takes up a map made before, with the robot at a pose in it that is taken as certain. Segments beyond the capacity are left out, and
     /// counted as refused.
     pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {
-        self.map.take_up(map);
+        self.map.take_up(map.iter().map(|entry| MapSegment { seen_at_m: 0.0, ..*entry }));
         self.estimator.begin_at(map_from_base, &self.config);
         self.places.clear();
     }
@@ -40,8 +40,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         }
         self.map.forget_broken();
         self.estimator.begin_anew(&self.config);
-        // What was half written of them is not known.
-        self.places.clear();
+        self.places.recover();
         true
     }
 }

@@ -37,7 +37,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         update: &mut SlamUpdate,
         watch: &mut impl FnMut(Stage),
     ) {
-        let Self { config, map, estimator, frontend, tracker, places, odometry, relocaliser, state, .. } = self;
+        let Self { config, map, estimator, frontend, tracker, places, odometry, relocaliser, state, .. } =
+            self;
         let Some(settings) = &config.relocalisation else { return };
         let scene = Scene { observed: frontend.segments(), map: map.segments(), config };
         let motion = &motion.since_previous;
@@ -55,7 +56,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         };
         let hypothesis = tracker.refined_at(&scene, &at, watch);
         update.take_pose(&hypothesis);
-        estimator.relocate(&hypothesis, config, map);
+        let at = Prior { pose: hypothesis.pose, covariance: hypothesis.covariance };
+        estimator.restart(&at, config, map);
         places.pass_lost();
         odometry.map_moved();
         state.found();

@@ -165,8 +165,7 @@ impl StateMonitor {
         if self.good >= config.found_after {
             self.contradicted = 0;
         }
-        self.displaced =
-            self.contradicted >= config.lost_after || self.missing > config.most_missing;
+        self.displaced = self.contradicted >= config.lost_after || self.missing > config.most_missing;
         self.state = if self.displaced {
             TrackingState::Lost
         } else if self.good >= config.found_after {
