@@ -9,6 +9,7 @@ use slam_core::map::store::MapError;
 use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::delay::Delay;
 use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
+use slam_core::relocalisation::Verdict;
 use slam_core::sensor::scan::SensorConfig;
 use slam_core::slam::Counters;
 use slam_core::{Mapper, ScanMotion, Slam, SlamConfig, SlamUpdate, WheelTicks};
@@ -207,7 +208,8 @@ fn run_sized<const BEAMS: usize>(
                 step.pose_in_final_map = places.moved_pose(step.update.way_m, &step.pose_in_final_map);
             }
         }
-        distance_m += match steps.last() {
+        let has_jumped = update.relocalisation.is_some_and(|r| r.verdict == Verdict::Found);
+        distance_m += match steps.last().filter(|_| !has_jumped) {
             // Without odometry as far as the scanner says.
             Some(before) if log.odometry.is_empty() => {
                 f64::from((update.pose.translation.vector - before.pose.translation.vector).norm())

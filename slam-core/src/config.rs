@@ -252,7 +252,7 @@ impl Default for SlamConfig {
                 guesses_per_scan: 10,
                 least_segments: 3,
                 least_support: 0.45,
-                min_support: 0.6,
+                min_support: 0.7,
                 max_runner_up: 0.65,
                 min_odds: 5.0,
                 scans: 5,
@@ -513,6 +513,8 @@ impl SlamConfig {
         positive("state.most_missing", self.state.most_missing)?;
         if let Some(relocalisation) = &self.relocalisation {
             relocalisation.validate()?;
+            // It looks for itself around places.
+            check("relocalisation", self.places.is_some())?;
         }
         if let Some(places) = &self.places {
             places.validate()?;

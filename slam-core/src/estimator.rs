@@ -71,6 +71,8 @@ pub(crate) struct Estimator {
     /// Scans before the one at hand.
     scans: u32,
     travelled_m: f32,
+    /// Way driven until the pose was found anew: what was seen before lies elsewhere.
+    jumped_at_m: f32,
 }
 
 /// Where a motion leads.
@@ -98,6 +100,7 @@ impl Estimator {
             next_tidied: 0,
             scans: 0,
             travelled_m: 0.0,
+            jumped_at_m: 0.0,
         }
     }
 
@@ -253,6 +256,13 @@ impl Estimator {
         self.set_anchor();
         self.map_from_base = after * before.inverse() * self.map_from_base;
         true
+    }
+
+    /// In a map that stays as it is: where a keyframe would be due, the pose alone is taken for what the filter knows.
+    pub fn follow<const N: usize>(&mut self, config: &SlamConfig, map: &mut SegmentMap<N>) {
+        if self.keyframe_is_due(&config.registration) {
+            self.restart(&self.local(), config, map);
+        }
     }
 
     /// Whether the scan at hand is to be taken into the map.

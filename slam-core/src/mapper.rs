@@ -317,7 +317,7 @@ impl<const N: usize, const K: usize, const BEAMS: usize, const P: usize> Mapper<
     fn learn_delay(&mut self, at_us: u64, update: &SlamUpdate) {
         let config = self.slam.config();
         let Some(delay) = config.odometry.delay else { return };
-        let left_out = update.odometry_left_out || update.odometry_useless;
+        let left_out = update.odometry_left_out || update.odometry_useless || update.relocalisation.is_some();
         let fixed = update.observability.verdict == Verdict::Full
             && update.support >= config.state.good_score
             && !left_out;

@@ -10,14 +10,14 @@
 //! Transactions on Robotics and Automation 17(5), 2001.
 
 use heapless::Vec;
-use nalgebra::{Isometry2, Matrix3, Vector3};
+use nalgebra::{Isometry2, Matrix3};
 
 use crate::config::{Checked, check, not_negative};
 use crate::geometry::math::{max, min};
 use crate::geometry::pose::components;
 use crate::geometry::segment::Segment;
 use crate::odometry::Increment;
-use crate::places::{Places, of_scan};
+use crate::places::{Places, diagonal, of_scan};
 use crate::sensor::scan::Scan;
 use crate::slam::Stage;
 use crate::tracking::correction::Prior;
@@ -45,12 +45,13 @@ pub struct RelocalisationConfig {
     pub min_odds: f32,
     /// Scans that it must have explained.
     pub scans: u8,
-    /// Its lead, by the share of the scans, summed over scans that lie so far apart, metres (a radian counts as a metre), …
+    /// Its lead, by the mean share of the scans, times their number, but not more than one for so much of the way since it was proposed,
+    /// metres (a radian counts as a metre), …
     pub apart_m: f32,
     /// … must be this.
     pub min_lead: f32,
-    /// Way after which a robot goes on from where it is thought to be, metres, if nothing in the map explains what it sees: it is where
-    /// nothing has been mapped.
+    /// Way on which nothing in the map explains what is seen, metres, from which on a robot goes on from where it is thought to be: it is
+    /// where nothing has been mapped.
     pub give_up_m: f32,
 }
 
@@ -81,8 +82,8 @@ const RIVAL_SCANS: u8 = 3;
 const SAME: [f32; 2] = [0.5, 0.26];
 /// … and one that explains so much more shows where the other should be.
 const BETTER: f32 = 0.1;
-/// How far off a pose may be that is proposed by a place: standard deviations, metres and radians.
-const PROPOSED: [f32; 2] = [0.2, 0.1];
+/// How far off a pose may be that is proposed by a place: standard deviations of x, y (m) and θ (rad).
+const PROPOSED: [f32; 3] = [0.2, 0.2, 0.1];
 /// Share of a scan that must lie where the map knows what stands, or it says nothing of a guess.
 const LEAST_KNOWN: f32 = 0.33;
 
@@ -141,20 +142,22 @@ pub(crate) struct Relocaliser {
     guesses: Vec<Guess, GUESSES>,
     /// The guess that is looked at next.
     next_guess: u8,
-    /// Places that are still to be asked, from the newest to the oldest.
-    places_left: u16,
-    complete: bool,
-    way_m: f32,
+    /// Places that have been asked since it began, from the newest to the oldest and again.
+    asked: u16,
+    /// Way on which nothing explained the scans, metres; a radian counts as a metre.
+    unexplained_m: f32,
+    /// Whether there is a pose to go on from where nothing does.
+    may_give_up: bool,
 }
 
 impl Relocaliser {
     pub const fn new() -> Self {
-        Self { guesses: Vec::new(), next_guess: 0, places_left: 0, complete: false, way_m: 0.0 }
+        Self { guesses: Vec::new(), next_guess: 0, asked: 0, unexplained_m: 0.0, may_give_up: false }
     }
 
     /// Begins anew: the robot may be anywhere, as well as where it is thought to be.
-    pub fn begin<const P: usize>(&mut self, thought: Option<Prior>, places: &Places<P>) {
-        *self = Self { places_left: places.anchors().len() as u16, ..Self::new() };
+    pub fn begin(&mut self, thought: Option<Prior>) {
+        *self = Self { may_give_up: thought.is_some(), ..Self::new() };
         if let Some(at) = thought {
             let _ = self.guesses.push(Guess::at(at));
         }
@@ -176,19 +179,31 @@ impl Relocaliser {
         config: &RelocalisationConfig,
         watch: &mut impl FnMut(Stage),
     ) -> Relocalisation {
-        let way_m = evidence.motion.distance_m + evidence.motion.turn_rad.abs();
-        self.way_m += way_m;
+        self.go_on(evidence.motion, predicted);
+        let says_something = evidence.scene.observed.len() >= usize::from(config.least_segments);
+        if says_something {
+            self.look_at_guesses(evidence, tracker, config, watch);
+            self.ask_places(evidence, tracker, config, watch);
+            self.merge();
+        }
+        let complete = usize::from(self.asked) >= evidence.places.anchors().len();
+        let outcome = self.judge(complete, config);
+        if says_something { outcome } else { Relocalisation { verdict: Verdict::Searching, ..outcome } }
+    }
+
+    /// Moves the guesses by the odometry. After a motion that is no number the robot may be anywhere.
+    pub fn go_on(&mut self, motion: &Increment, predicted: impl Fn(&Prior) -> Prior) {
+        if !motion.is_finite() {
+            self.begin(None);
+            return;
+        }
+        let way_m = motion.distance_m + motion.turn_rad.abs();
+        self.unexplained_m += way_m;
         for guess in &mut self.guesses {
             let prior = predicted(&guess.prior());
             (guess.pose, guess.covariance) = (prior.pose, prior.covariance);
             guess.way_m += way_m;
         }
-        if evidence.scene.observed.len() >= usize::from(config.least_segments) {
-            self.look_at_guesses(evidence, tracker, config, watch);
-            self.ask_places(evidence, tracker, config, watch);
-            self.merge();
-        }
-        self.judge(config)
     }
 
     /// Holds the scan against those of the guesses whose turn it is.
@@ -221,12 +236,13 @@ impl Relocaliser {
         watch: &mut impl FnMut(Stage),
     ) {
         let seen = of_scan(evidence.scene.observed);
-        for _ in 0..config.places_per_scan {
-            let Some(place) = self.places_left.checked_sub(1) else { break };
-            self.places_left = place;
+        let places = evidence.places.anchors().len();
+        for _ in 0..usize::from(config.places_per_scan).min(places) {
+            let place = places - 1 - usize::from(self.asked) % places;
+            self.asked = self.asked.saturating_add(1);
             let (map, sensor) = (evidence.scene.map, &evidence.scene.config.sensor);
-            for pose in evidence.places.poses_of(place.into(), &seen, map, sensor.reach_m()) {
-                let proposed = Prior { pose, covariance: variances(PROPOSED) };
+            for pose in evidence.places.poses_of(place, &seen, map, sensor.reach_m()) {
+                let proposed = Prior { pose, covariance: diagonal(PROPOSED) };
                 if let Some((hypothesis, support)) = held_against(evidence, &proposed, tracker, watch)
                     && support >= config.least_support
                 {
@@ -235,9 +251,6 @@ impl Relocaliser {
                     self.add(guess);
                 }
             }
-        }
-        if self.places_left == 0 {
-            (self.places_left, self.complete) = (evidence.places.anchors().len() as u16, true);
         }
     }
 
@@ -265,18 +278,22 @@ impl Relocaliser {
         }
     }
 
-    fn judge(&self, config: &RelocalisationConfig) -> Relocalisation {
+    fn judge(&mut self, complete: bool, config: &RelocalisationConfig) -> Relocalisation {
         let best = self.guesses.iter().max_by(|a, b| a.support.total_cmp(&b.support)).copied();
         let is_rival =
             |guess: &&Guess| guess.scans >= RIVAL_SCANS && best.is_some_and(|best| !best.is_same(guess));
         let runner_up = self.guesses.iter().filter(is_rival).map(|g| g.support).fold(0.0, max);
         let explains = best.is_some_and(|best| best.support >= config.min_support);
+        if explains {
+            self.unexplained_m = 0.0;
+        }
+        let gives_up = self.may_give_up && self.unexplained_m >= config.give_up_m;
         let verdict = match best {
-            Some(best) if self.complete && explains && best.stands_out(runner_up, config) => Verdict::Found,
-            _ if self.complete && !explains && self.way_m >= config.give_up_m => Verdict::GivenUp,
+            Some(best) if complete && explains && best.stands_out(runner_up, config) => Verdict::Found,
+            _ if complete && gives_up => Verdict::GivenUp,
             _ => Verdict::Searching,
         };
-        Relocalisation { best, runner_up, complete: self.complete, verdict }
+        Relocalisation { best, runner_up, complete, verdict }
     }
 }
 
@@ -332,8 +349,4 @@ fn held_against<const N: usize, const P: usize>(
     let contradicted = tracker.contradicted_share(scene, scan, &pose);
     let support = tracker.score_of(scene, &pose, is_known) * (1.0 - contradicted);
     Some((hypothesis, support))
-}
-
-fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
-    Matrix3::from_diagonal(&Vector3::new(position * position, position * position, heading * heading))
 }

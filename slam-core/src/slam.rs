@@ -79,9 +79,12 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
                 self.register(&mut update, watch);
                 self.forget(scan, &update);
                 self.keep_places(&by_odometry, &mut update);
+            } else {
+                let Self { config, estimator, map, .. } = self;
+                estimator.follow(config, map);
             }
         } else {
-            self.places.pass_blindly(&by_odometry);
+            self.pass_unseen(&by_odometry);
         }
         self.finish(&mut update);
         update
@@ -181,7 +184,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         update.state = self.state.update(&evidence, &self.config.state);
         if self.is_relocalising() {
             // It may as well be where it is thought to be.
-            self.relocaliser.begin(Some(self.estimator.local()), &self.places);
+            self.relocaliser.begin(Some(self.estimator.local()));
         }
     }
 

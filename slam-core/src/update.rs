@@ -41,8 +41,10 @@ pub struct Counters {
     pub searched: u32,
     /// Scans at which the robot was lost.
     pub lost: u32,
-    /// Times that a displaced robot found itself in its map.
+    /// Times that a displaced robot found itself in its map, …
     pub relocalised: u32,
+    /// … and that it went on from where it was thought to be.
+    pub gave_up: u32,
 }
 
 impl Counters {
@@ -63,8 +65,9 @@ impl Counters {
         add(&mut self.odometry_left_out, u32::from(update.odometry_left_out));
         add(&mut self.searched, u32::from(update.searched));
         add(&mut self.lost, u32::from(update.state == TrackingState::Lost));
-        let found = update.relocalisation.is_some_and(|r| r.verdict == Verdict::Found);
-        add(&mut self.relocalised, u32::from(found));
+        let verdict = update.relocalisation.map(|r| r.verdict);
+        add(&mut self.relocalised, u32::from(verdict == Some(Verdict::Found)));
+        add(&mut self.gave_up, u32::from(verdict == Some(Verdict::GivenUp)));
     }
 }
 

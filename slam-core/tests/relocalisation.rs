@@ -170,7 +170,9 @@ fn where_nothing_has_been_mapped_it_goes_on_in_the_end() {
     }
     let last = updates.iter().rev().find_map(|u| u.relocalisation).expect("it was lost");
     assert_eq!((last.verdict, found(&updates)), (Verdict::GivenUp, None));
-    assert!(drive.slam.state() != TrackingState::Lost);
+    let given_up = updates.iter().find(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::GivenUp));
+    assert_eq!(given_up.map(|u| u.state), Some(TrackingState::Uncertain));
+    assert_eq!((drive.slam.counters().gave_up, drive.slam.guesses().len()), (1, 0));
 }
 
 #[test]
@@ -238,7 +240,7 @@ fn a_map_that_cannot_be_used_changes_nothing() {
         lines: &lines,
         places: &places,
         loops: &loops,
-        way_m: 9.0,
+        way_m: drive.slam.way_m(),
         odometry_bias: drive.slam.odometry_bias(),
     };
     let mut bad_lines = lines.clone();
@@ -253,10 +255,39 @@ fn a_map_that_cannot_be_used_changes_nothing() {
         (StoredMap { places: &bad_places, ..whole }, "places[0] has a number that makes no sense"),
         (StoredMap { loops: &[edge], ..whole }, "loops[0] has a number that makes no sense"),
         (StoredMap { lines: &many, ..whole }, "the map has 129 lines, there is room for 128"),
-        (StoredMap { way_m: f32::INFINITY, ..whole }, "way_m or odometry_bias is no number"),
+        (
+            StoredMap { places: &[], ..whole },
+            "the map has no places to look for the robot: say where it stands",
+        ),
+        (StoredMap { way_m: f32::INFINITY, ..whole }, "way_m or odometry_bias makes no sense"),
     ] {
         assert_eq!(drive.slam.load(&map, None).unwrap_err().to_string(), says);
     }
     assert_eq!((drive.slam.map().segments().to_vec(), drive.slam.pose()), before);
     assert_eq!(drive.slam.state(), TrackingState::Tracking);
+}
+
+#[test]
+fn motions_that_are_no_numbers_and_scans_that_are_none_are_survived() {
+    let mut drive = Drive::new(room(0.0, 0.0), pose(1.0, 1.0, 0.0));
+    for (x, y) in [(3.5, 1.0), (3.5, 3.0), (1.5, 3.0)] {
+        drive.to(x, y);
+    }
+    drive.slam.relocalise();
+    drive.stand(3);
+    assert!(!drive.slam.guesses().is_empty());
+    let mut broken = ScanMotion::instantaneous(Increment::identity());
+    broken.since_previous.before_from_after.translation.x = f32::NAN;
+    let ranges_mm = ranges_mm(&drive.walls, &drive.config, &drive.truth);
+    drive.slam.process_scan(&Scan { ranges_mm: &ranges_mm }, &broken);
+    drive.slam.process_scan(&Scan { ranges_mm: &[] }, &broken);
+    // What is coasted on while scans stay away moves the guesses too.
+    drive.stand(3);
+    drive.truth *= pose(0.2, 0.0, 0.1);
+    drive.slam.coast(&Increment::from_motion(pose(0.2, 0.0, 0.1)));
+    let guessed = |drive: &Drive| drive.slam.guesses().iter().any(|g| g.scans > 0 && g.support > 0.8);
+    drive.stand(1);
+    assert!(guessed(&drive));
+    let driving = [drive.to(2.5, 1.0), drive.to(3.5, 1.0)].concat();
+    assert!(found(&driving).is_some() && drive.off().0 < 0.05, "{:?}", drive.off());
 }

@@ -20,6 +20,8 @@ pub struct Tracking {
     pub first_lost_s: Option<f64>,
     /// Times that it found itself in its map again.
     pub relocalised: usize,
+    /// Times that it did not, and went on from where it was thought to be.
+    pub gave_up: usize,
     /// Scans that overruled the odometry.
     pub odometry_left_out: usize,
     /// Stamp of the first of these, seconds.
@@ -47,6 +49,7 @@ impl Tracking {
             lost,
             first_lost_s,
             relocalised: counted(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::Found)).0,
+            gave_up: counted(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::GivenUp)).0,
             odometry_left_out,
             first_left_out_s,
             odometry_useless,

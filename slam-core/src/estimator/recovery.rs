@@ -19,18 +19,29 @@ impl Estimator {
         self.begin_anew(config);
     }
 
-    /// Begins anew in a map that was saved, at a pose that is taken as certain.
-    pub fn begin_in(&mut self, saved: &StoredMap<'_>, map_from_base: Isometry2<f32>, config: &SlamConfig) {
-        if let Some(filter) = &mut self.filter {
+    /// Begins anew in a map that was saved.
+    pub fn begin_in<const N: usize>(
+        &mut self,
+        saved: &StoredMap<'_>,
+        at: &Prior,
+        config: &SlamConfig,
+        map: &mut SegmentMap<N>,
+    ) {
+        if let Some(filter) = self.filter.as_mut().filter(|_| config.odometry.bias.is_some()) {
             filter.set_bias(saved.odometry_bias);
         }
+        if let Some(ekf) = config.registration.ekf() {
+            // What is seen first does not say where the map's frame lies.
+            self.scans = self.scans.max(ekf.keyframes.at_start.saturating_add(1));
+        }
         self.travelled_m = saved.way_m;
-        self.begin_at(map_from_base, config);
+        self.restart(at, config, map);
     }
 
     /// Begins anew at a pose with a covariance.
     pub fn restart<const N: usize>(&mut self, at: &Prior, config: &SlamConfig, map: &mut SegmentMap<N>) {
         (self.map_from_base, self.local_covariance) = (at.pose, at.covariance);
+        self.jumped_at_m = self.travelled_m;
         self.restart_way();
         self.begin_anew(config);
         if let Some(filter) = &mut self.filter {

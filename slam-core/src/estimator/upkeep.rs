@@ -29,7 +29,8 @@ impl Estimator {
         self.commit(around);
         for index in 0..around.map.segments().len() {
             let Some(entry) = around.map.get_mut(index) else { continue };
-            let is_local = self.travelled_m - entry.seen_at_m <= config.local_m;
+            let is_local =
+                self.travelled_m - entry.seen_at_m <= config.local_m && entry.seen_at_m >= self.jumped_at_m;
             let by = if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.segment.midpoint()) };
             let segment = entry.segment.transformed(&by);
             if segment.is_finite() {

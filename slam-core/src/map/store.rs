@@ -16,6 +16,12 @@ use crate::places::{Anchor, Loop, PLACE_LINES, PlaceLine};
 /// Version of what is stored here. A map of another version is not read.
 pub const VERSION: u16 = 1;
 
+/// Numbers beyond these make no sense: coordinates and ways, metres; standard deviations, metres and radians; errors of the odometry.
+const FARTHEST_M: f32 = 1e5;
+const LEAST_SIGMA: f32 = 1e-6;
+const MOST_SIGMA: f32 = 10.0;
+const MOST_BIAS: f32 = 0.5;
+
 /// A wall.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(deny_unknown_fields))]
@@ -60,8 +66,12 @@ impl StoredLine {
         let ([ax, ay], [bx, by]) = (self.start_m, self.end_m);
         let (start, end) = (Point2::new(ax, ay), Point2::new(bx, by));
         let length_m = sqrt((end - start).norm_squared());
-        let are_positive = length_m > 0.0 && self.sigma_offset_m > 0.0 && self.sigma_direction_rad > 0.0;
-        if !are_positive || !self.seen_at_m.is_finite() {
+        let sigmas = [self.sigma_offset_m, self.sigma_direction_rad];
+        let makes_sense = length_m > 0.0
+            && [ax, ay, bx, by, self.seen_at_m].iter().all(|v| v.abs() < FARTHEST_M)
+            && sigmas.iter().all(|sigma| (LEAST_SIGMA..MOST_SIGMA).contains(sigma))
+            && (-length_m..2.0 * length_m).contains(&self.middle_m);
+        if !makes_sense {
             return None;
         }
         let direction = (end - start) / length_m;
@@ -170,8 +180,29 @@ pub struct StoredMap<'a> {
     pub loops: &'a [StoredLoop],
     /// Way driven until then, metres.
     pub way_m: f32,
-    /// Systematic errors of the odometry, see [`OdometryBias`].
+    /// Systematic errors of the odometry of the robot that drove there.
     pub odometry_bias: OdometryBias,
+}
+
+impl StoredMap<'_> {
+    /// Whether all numbers make sense.
+    pub(crate) fn check(&self) -> Result<(), MapError> {
+        let invalid = |what, index: Option<usize>| match index {
+            Some(index) => Err(MapError::Invalid { what, index }),
+            None => Ok(()),
+        };
+        let mut reached_m = 0.0;
+        let goes_back = |place: &StoredPlace| {
+            let before_m = core::mem::replace(&mut reached_m, place.way_m);
+            place.anchor().is_none() || !(before_m..=self.way_m).contains(&place.way_m)
+        };
+        invalid("lines", self.lines.iter().position(|line| line.entry().is_none()))?;
+        invalid("places", self.places.iter().position(goes_back))?;
+        invalid("loops", self.loops.iter().position(|edge| edge.edge(self.places.len()).is_none()))?;
+        let bias = self.odometry_bias.0;
+        let makes_sense = (0.0..FARTHEST_M).contains(&self.way_m) && bias.iter().all(|v| v.abs() < MOST_BIAS);
+        if makes_sense { Ok(()) } else { Err(MapError::OutOfRange) }
+    }
 }
 
 /// Why a map cannot be used.
@@ -195,8 +226,10 @@ pub enum MapError {
         /// Which, from zero.
         index: usize,
     },
-    /// The way or the odometry's errors are no numbers.
-    NotFinite,
+    /// The way or the odometry's errors make no sense.
+    OutOfRange,
+    /// The robot may be anywhere, and there are no places to look for it, or the configuration does not look.
+    NowhereToLook,
 }
 
 impl MapError {
@@ -212,7 +245,10 @@ impl core::fmt::Display for MapError {
                 write!(f, "the map has {count} {what}, there is room for {capacity}")
             }
             Self::Invalid { what, index } => write!(f, "{what}[{index}] has a number that makes no sense"),
-            Self::NotFinite => write!(f, "way_m or odometry_bias is no number"),
+            Self::OutOfRange => write!(f, "way_m or odometry_bias makes no sense"),
+            Self::NowhereToLook => {
+                write!(f, "the map has no places to look for the robot: say where it stands")
+            }
         }
     }
 }

@@ -208,7 +208,7 @@ const NEAR_M2: f32 = 9.0;
 const NEAR_RAD: f32 = 0.8;
 
 /// Variances (x, y, θ) as a covariance.
-pub(super) fn diagonal(sigmas: [f32; 3]) -> Matrix3<f32> {
+pub(crate) fn diagonal(sigmas: [f32; 3]) -> Matrix3<f32> {
     Matrix3::from_diagonal(&Vector3::from(sigmas.map(|s| s * s)))
 }
 

@@ -106,7 +106,7 @@ fn ray(start: Point2<f32>, end: Point2<f32>) -> Option<Ray> {
 /// Lines of the map around a pose that are looked through for where a robot is.
 const AROUND: usize = 48;
 
-/// The longest lines of the map that begin within `reach_m` of a pose, in its frame, sorted by direction. Work: a pass over the map.
+/// The longest lines of the map of which a point lies within `reach_m` of a pose, in its frame, sorted by direction. Work: a pass over the map.
 pub(super) fn around(map: &[MapSegment], at: &Isometry2<f32>, reach_m: f32) -> Vec<Ray, AROUND> {
     let is_near = |segment: &Segment| {
         let nearest = segment.nearest_to(at.translation.vector.into());

@@ -31,6 +31,7 @@ use crate::map::walls::WallConfig;
 use crate::odometry::Increment;
 use crate::tracking::correction::Verdict;
 use chain::Support;
+pub(crate) use chain::diagonal;
 pub use chain::{Anchor, Chain};
 pub use factor::LOOPS;
 use finding::{Finder, Known};
@@ -150,6 +151,8 @@ pub struct Places<const P: usize> {
     rested: bool,
     /// A solution is being swapped in, and what was seen moves with it.
     is_moving: bool,
+    /// The robot is elsewhere than on the way from the last place: a place begins at once.
+    has_jumped: bool,
 }
 
 impl<const P: usize> Places<P> {
@@ -172,6 +175,7 @@ impl<const P: usize> Places<P> {
             without_lines: 0,
             rested: false,
             is_moving: false,
+            has_jumped: false,
         }
     }
 
@@ -182,7 +186,7 @@ impl<const P: usize> Places<P> {
         self.solver.clear();
         self.finder = Finder::new();
         (self.support, self.is_stale, self.without_lines) = (Support::NONE, false, 0);
-        self.is_moving = false;
+        (self.is_moving, self.has_jumped) = (false, false);
     }
 
     /// Puts in order what a reset may have left half done. Where places were moving, or one was half written, all are forgotten: the map
@@ -190,7 +194,10 @@ impl<const P: usize> Places<P> {
     pub(crate) fn recover(&mut self) {
         let anchors = self.chain.anchors();
         let is_whole = |anchor: &Anchor| StoredPlace::of(anchor).anchor().is_some();
-        let in_order = anchors.is_sorted_by(|before, after| before.way_m < after.way_m);
+        // A robot that turns on the spot has places of the same way, but not the same place twice.
+        let in_order = anchors.is_sorted_by(|before, after| {
+            before.way_m < after.way_m || (before.way_m == after.way_m && before.pose != after.pose)
+        });
         let loops = self.loops.iter().all(|edge| StoredLoop::of(edge).edge(anchors.len()).is_some());
         if self.is_moving || !in_order || !loops || !anchors.iter().all(is_whole) {
             self.clear();
@@ -222,6 +229,8 @@ impl<const P: usize> Places<P> {
         }
         // The posterior is that of a solution.
         self.is_stale = !self.loops.is_empty();
+        let waiting = self.chain.anchors.iter().rev().take_while(|anchor| anchor.lines.is_empty());
+        self.without_lines = waiting.take(2).count() as u8;
         fits
     }
 
@@ -242,7 +251,9 @@ impl<const P: usize> Places<P> {
     pub(crate) fn visit(&mut self, visit: &Visit<'_>, config: &PlacesConfig) {
         self.support.add(&visit.motion, visit.verdict, visit.support);
         let is_due = self.chain.anchors.last().is_none_or(|last| {
-            visit.way_m - last.way_m >= config.way_m || turn(&last.pose, &visit.pose).abs() >= config.turn_rad
+            self.has_jumped
+                || visit.way_m - last.way_m >= config.way_m
+                || turn(&last.pose, &visit.pose).abs() >= config.turn_rad
         });
         if !is_due {
             return;
@@ -256,7 +267,7 @@ impl<const P: usize> Places<P> {
         if !self.chain.push(visit.pose, visit.way_m, self.support.variances(config.sigma_scale)) {
             return;
         }
-        self.support = Support::NONE;
+        (self.support, self.has_jumped) = (Support::NONE, false);
         self.without_lines = self.chain.anchors.len().min(2) as u8;
     }
 
@@ -312,6 +323,7 @@ impl<const P: usize> Places<P> {
     /// The robot was displaced, and found where the map says: how it came there is not known, and what it is off by from the places before.
     pub(crate) fn pass_lost(&mut self) {
         self.support.lose();
+        self.has_jumped = true;
     }
 
     /// Does a bounded bit of work: the lines of a place, or one step of a solution that is on its way, or one of the search for loops.

@@ -5,6 +5,7 @@ use nalgebra::{Isometry2, Matrix3};
 use super::Slam;
 use crate::map::MapSegment;
 use crate::odometry::Increment;
+use crate::relocalisation::Relocaliser;
 
 impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Moves the robot by odometry alone, where no scan has come.
@@ -13,7 +14,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         let is_usable = estimator.coast(motion, &mut around);
         self.counters.count_motion(is_usable);
         self.counters.coasted = self.counters.coasted.saturating_add(1);
-        self.places.pass_blindly(motion);
+        self.pass_unseen(motion);
         self.estimator.pose()
     }
 
@@ -23,6 +24,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         self.map.take_up(map.iter().map(|entry| MapSegment { seen_at_m: 0.0, ..*entry }));
         self.estimator.begin_at(map_from_base, &self.config);
         self.places.clear();
+        self.begin_anew();
     }
 
     /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.
@@ -41,6 +43,10 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         self.map.forget_broken();
         self.estimator.begin_anew(&self.config);
         self.places.recover();
+        self.relocaliser = Relocaliser::new();
+        if self.is_relocalising() {
+            self.relocalise();
+        }
         true
     }
 }

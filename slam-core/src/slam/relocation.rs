@@ -1,12 +1,18 @@
 //! A robot that was displaced looks for itself in its map.
 
 use super::Slam;
+use crate::odometry::Increment;
 use crate::odometry::track::ScanMotion;
-use crate::relocalisation::{Evidence, Guess, Verdict};
+use crate::places::diagonal;
+use crate::relocalisation::{Evidence, Guess, Relocaliser, Verdict};
 use crate::sensor::scan::Scan;
 use crate::tracking::correction::Prior;
 use crate::tracking::tracker::Scene;
 use crate::update::{SlamUpdate, Stage};
+
+/// How far off a robot may be that was displaced where nothing is known, or begins where somebody says: standard deviations of x, y (m)
+/// and θ (rad).
+pub(super) const THOUGHT: [f32; 3] = [0.2, 0.2, 0.1];
 
 impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// The robot may be anywhere in its map: it is [`Lost`](crate::tracking::TrackingState::Lost) from now on, and looks for itself with each
@@ -15,7 +21,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     pub fn relocalise(&mut self) {
         if self.config.relocalisation.is_some() {
             self.state.displace();
-            self.relocaliser.begin(None, &self.places);
+            self.relocaliser.begin(None);
         }
     }
 
@@ -27,6 +33,16 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Whether the pose is not tracked, but looked for.
     pub(super) fn is_relocalising(&self) -> bool {
         self.config.relocalisation.is_some() && self.state.is_displaced()
+    }
+
+    /// The robot moved where no scan was taken in.
+    pub(super) fn pass_unseen(&mut self, motion: &Increment) {
+        let is_relocalising = self.is_relocalising();
+        let Self { config, estimator, places, odometry, relocaliser, .. } = self;
+        places.pass_blindly(motion);
+        if is_relocalising {
+            relocaliser.go_on(motion, |at| estimator.predicted(at, motion, odometry, config));
+        }
     }
 
     /// Takes a scan to look for the robot; where it is found it goes on from there.
@@ -48,7 +64,10 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         update.relocalisation = Some(outcome);
         let at = match (outcome.verdict, outcome.best) {
             (Verdict::Found, Some(found)) => found.prior(),
-            (Verdict::GivenUp, _) => estimator.local(),
+            (Verdict::GivenUp, _) => {
+                let Prior { pose, covariance } = estimator.local();
+                Prior { pose, covariance: covariance + diagonal(THOUGHT) }
+            }
             _ => {
                 tracker.forget_pairs();
                 return;
@@ -60,6 +79,10 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         estimator.restart(&at, config, map);
         places.pass_lost();
         odometry.map_moved();
-        state.found();
+        *relocaliser = Relocaliser::new();
+        match outcome.verdict {
+            Verdict::GivenUp => state.give_up(),
+            _ => state.found(),
+        }
     }
 }

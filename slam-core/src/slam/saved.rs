@@ -3,8 +3,11 @@
 use nalgebra::Isometry2;
 
 use super::Slam;
+use super::relocation::THOUGHT;
 use crate::map::store::{MapError, StoredLine, StoredLoop, StoredMap, StoredPlace};
-use crate::places::LOOPS;
+use crate::places::{LOOPS, diagonal};
+use crate::relocalisation::Relocaliser;
+use crate::tracking::correction::Prior;
 
 impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// The walls of the map, to be saved.
@@ -27,40 +30,48 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         self.estimator.travelled_m()
     }
 
-    /// Takes a saved map in place of the one there is. The robot stands at a pose in it, which is taken as certain, or looks for
+    /// Takes a saved map in place of the one there is. The robot stands near a pose in it, within some 20 cm and 6°, or looks for
     /// itself. Fails without having changed anything.
     pub fn load(&mut self, map: &StoredMap<'_>, at: Option<Isometry2<f32>>) -> Result<(), MapError> {
         MapError::check_room("lines", map.lines.len(), N)?;
         MapError::check_room("places", map.places.len(), P)?;
         MapError::check_room("loops", map.loops.len(), LOOPS)?;
-        let invalid = |what, index: Option<usize>| match index {
-            Some(index) => Err(MapError::Invalid { what, index }),
-            None => Ok(()),
-        };
-        invalid("lines", map.lines.iter().position(|line| line.entry().is_none()))?;
-        invalid("places", map.places.iter().position(|place| place.anchor().is_none()))?;
-        invalid("loops", map.loops.iter().position(|edge| edge.edge(map.places.len()).is_none()))?;
-        if !map.way_m.is_finite() || !map.odometry_bias.0.iter().all(|v| v.is_finite()) {
-            return Err(MapError::NotFinite);
+        map.check()?;
+        let may_look = self.config.relocalisation.is_some() && !map.places.is_empty();
+        if at.is_none() && !may_look {
+            return Err(MapError::NowhereToLook);
         }
         self.map.take_up(map.lines.iter().filter_map(StoredLine::entry));
         let anchors = map.places.iter().filter_map(StoredPlace::anchor);
         let loops = map.loops.iter().filter_map(|edge| edge.edge(map.places.len()));
         self.places.restore(anchors, loops);
-        self.places.pass_lost();
-        self.estimator.begin_in(map, at.unwrap_or_else(Isometry2::identity), &self.config);
+        let Self { config, estimator, map: lines, .. } = self;
+        let pose = at.unwrap_or_else(Isometry2::identity);
+        estimator.begin_in(map, &Prior { pose, covariance: diagonal(THOUGHT) }, config, lines);
+        self.begin_anew();
         if at.is_none() {
             self.relocalise();
         }
         Ok(())
     }
 
+    /// What was known of the way until now says nothing of the map there is now.
+    pub(super) fn begin_anew(&mut self) {
+        self.places.pass_lost();
+        self.odometry.map_moved();
+        self.relocaliser = Relocaliser::new();
+        self.state.found();
+    }
+
     /// Whether the map learns from what is seen, as it does at first, or stays as it is, and the robot only finds its way in it.
     pub fn set_mapping(&mut self, mapping: bool) {
-        if mapping && !self.mapping {
-            let at = self.estimator.local();
-            self.estimator.restart(&at, &self.config, &mut self.map);
-            self.places.pass_lost();
+        if mapping != self.mapping {
+            // What the last keyframe has still to say is said; the filter goes on from where the robot stands.
+            let (estimator, mut around) = self.estimator();
+            estimator.commit(&mut around);
+            let Self { config, estimator, map, places, .. } = self;
+            estimator.restart(&estimator.local(), config, map);
+            places.pass_lost();
         }
         self.mapping = mapping;
     }

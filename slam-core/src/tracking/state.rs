@@ -150,6 +150,11 @@ impl StateMonitor {
         }
     }
 
+    /// It was not found, and goes on all the same.
+    pub fn give_up(&mut self) {
+        *self = Self { state: TrackingState::Uncertain, ..Self::default() };
+    }
+
     /// Takes in a scan.
     pub fn update(&mut self, evidence: &Evidence, config: &StateConfig) -> TrackingState {
         let next = |counter: u8, holds: bool| if holds { counter.saturating_add(1) } else { 0 };
@@ -277,5 +282,9 @@ mod tests {
         let mut monitor = standing(0.95);
         monitor.displace();
         assert!(monitor.is_displaced() && monitor.state() == TrackingState::Lost);
+        monitor.give_up();
+        assert!(!monitor.is_displaced());
+        assert_eq!(creep(&mut monitor, 0.4, 0.1, 5), TrackingState::Uncertain);
+        assert_eq!(creep(&mut monitor, 0.9, 0.1, 3), TrackingState::Tracking);
     }
 }
