@@ -84,8 +84,8 @@ impl MapFile {
         }
     }
 
-    /// Reads a file, and checks that a `Slam` of the usual size takes it.
-    pub fn load(path: &Path) -> Result<Self, MapFileError> {
+    /// Reads a file, and checks that a `Slam` of the usual size takes it, with the robot at a pose or anywhere.
+    pub fn load(path: &Path, at: Option<Isometry2<f32>>) -> Result<Self, MapFileError> {
         let own = || path.to_owned();
         let text = std::fs::read_to_string(path).map_err(|e| MapFileError::Read(own(), e))?;
         let json = |e| MapFileError::Json(own(), e);
@@ -102,7 +102,7 @@ impl MapFile {
             Slam::<{ crate::replay::MAP_SEGMENTS }, 682>::new(slam_core::SlamConfig::default())
                 .expect("the default is fine"),
         );
-        slam.load(&file.stored(), None).map_err(|e| MapFileError::Map(own(), e))?;
+        slam.load(&file.stored(), at).map_err(|e| MapFileError::Map(own(), e))?;
         Ok(file)
     }
 

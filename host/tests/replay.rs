@@ -798,6 +798,7 @@ fn maps_that_are_none_are_refused() {
     }
     let map = bench.file("map.json", good);
     let map = map.to_str().unwrap();
+    bench.refuses(&log, &["--map", map], &["map.json", "no places", "where it stands"]);
     bench.refuses(&log, &["--map", "missing.json"], &["missing.json", "No such file"]);
     bench.refuses(&log, &["--map", map, "--config", "paper"], &["--map", "--config paper"]);
     bench.refuses(&log, &["--map", map, "--start", "1,2"], &["--start", "2 numbers", "X,Y,DEG"]);

@@ -57,10 +57,10 @@ fn start_pose(text: &str) -> Result<Isometry2<f32>, String> {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let map = args.map.as_deref().map(MapFile::load).transpose()?;
-    if map.is_some() && args.config != Configuration::Default {
+    if args.map.is_some() && args.config != Configuration::Default {
         return Err(MapFileError::Configuration(args.config.name()).into());
     }
+    let map = args.map.as_deref().map(|path| MapFile::load(path, args.start)).transpose()?;
     let start = Start { map, pose: args.start, frozen: args.localise };
     // A given robot file is checked first: its beams are what the log must have.
     let given = args.robot.as_deref().map(Robot::load).transpose()?;
