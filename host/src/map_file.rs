@@ -16,6 +16,9 @@ const FORMAT: &str = "lineslam map";
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MapFile {
+    /// Where it was read.
+    #[serde(skip)]
+    path: PathBuf,
     format: String,
     version: u16,
     /// Way driven until then, metres.
@@ -74,6 +77,7 @@ impl MapFile {
     /// What a `Slam` knows.
     pub fn of<const N: usize, const BEAMS: usize, const P: usize>(slam: &Slam<N, BEAMS, P>) -> Self {
         Self {
+            path: PathBuf::new(),
             format: FORMAT.into(),
             version: VERSION,
             way_m: slam.way_m(),
@@ -84,8 +88,8 @@ impl MapFile {
         }
     }
 
-    /// Reads a file, and checks that a `Slam` of the usual size takes it, with the robot at a pose or anywhere.
-    pub fn load(path: &Path, at: Option<Isometry2<f32>>) -> Result<Self, MapFileError> {
+    /// Reads a file.
+    pub fn load(path: &Path) -> Result<Self, MapFileError> {
         let own = || path.to_owned();
         let text = std::fs::read_to_string(path).map_err(|e| MapFileError::Read(own(), e))?;
         let json = |e| MapFileError::Json(own(), e);
@@ -98,12 +102,7 @@ impl MapFile {
             return Err(MapFileError::Version { path: own(), found });
         }
         let file: Self = serde_json::from_str(&text).map_err(json)?;
-        let mut slam = Box::new(
-            Slam::<{ crate::replay::MAP_SEGMENTS }, 682>::new(slam_core::SlamConfig::default())
-                .expect("the default is fine"),
-        );
-        slam.load(&file.stored(), at).map_err(|e| MapFileError::Map(own(), e))?;
-        Ok(file)
+        Ok(Self { path: own(), ..file })
     }
 
     /// As the core takes it.
@@ -122,8 +121,8 @@ impl MapFile {
         &self,
         mapper: &mut Mapper<N, K, BEAMS>,
         at: Option<Isometry2<f32>>,
-    ) -> Result<(), MapError> {
-        mapper.load(&self.stored(), at)
+    ) -> Result<(), MapFileError> {
+        mapper.load(&self.stored(), at).map_err(|e| MapFileError::Map(self.path.clone(), e))
     }
 
     /// The bytes of the file: a line for each wall, place and loop.

@@ -5,17 +5,16 @@ use std::time::{Duration, Instant};
 use nalgebra::Isometry2;
 use slam_core::config::ConfigError;
 use slam_core::geometry::pose::pose;
-use slam_core::map::store::MapError;
 use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::delay::Delay;
 use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
-use slam_core::relocalisation::Verdict;
+use slam_core::relocalisation::SearchState;
 use slam_core::sensor::scan::SensorConfig;
 use slam_core::slam::Counters;
 use slam_core::{Mapper, ScanMotion, Slam, SlamConfig, SlamUpdate, WheelTicks};
 
 use crate::log::{Log, Odometry};
-use crate::map_file::MapFile;
+use crate::map_file::{MapFile, MapFileError};
 use crate::robot::{Robot, Wheels};
 
 /// Map segments of the replayed `Slam`: what the firmware has.
@@ -53,8 +52,8 @@ pub enum ReplayError {
         robot: String,
     },
     /// The map to begin in cannot be used.
-    #[error("the map")]
-    Map(#[from] MapError),
+    #[error(transparent)]
+    Map(#[from] MapFileError),
     /// Robot and configuration do not make sense together.
     #[error("robot '{robot}'")]
     Config {
@@ -208,7 +207,7 @@ fn run_sized<const BEAMS: usize>(
                 step.pose_in_final_map = places.moved_pose(step.update.way_m, &step.pose_in_final_map);
             }
         }
-        let has_jumped = update.relocalisation.is_some_and(|r| r.verdict == Verdict::Found);
+        let has_jumped = update.relocalisation.is_some_and(|r| r.state == SearchState::Found);
         distance_m += match steps.last().filter(|_| !has_jumped) {
             // Without odometry as far as the scanner says.
             Some(before) if log.odometry.is_empty() => {

@@ -258,13 +258,6 @@ impl Estimator {
         true
     }
 
-    /// In a map that stays as it is: where a keyframe would be due, the pose alone is taken for what the filter knows.
-    pub fn follow<const N: usize>(&mut self, config: &SlamConfig, map: &mut SegmentMap<N>) {
-        if self.keyframe_is_due(&config.registration) {
-            self.restart(&self.local(), config, map);
-        }
-    }
-
     /// Whether the scan at hand is to be taken into the map.
     pub fn keyframe_is_due(&self, config: &RegistrationConfig) -> bool {
         config.ekf().is_none_or(|config| self.keyframe.is_due(self.scans, &config.keyframes))

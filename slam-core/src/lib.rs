@@ -75,6 +75,7 @@ extern crate std;
 pub mod config;
 pub mod ekf;
 mod estimator;
+mod few;
 pub mod frontend;
 pub mod geometry;
 pub mod map;

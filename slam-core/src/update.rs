@@ -8,7 +8,7 @@ use crate::frontend::extraction::ExtractionReport;
 use crate::map::MapCounters;
 use crate::odometry::wheel_faults::WheelFault;
 use crate::places::Closure;
-use crate::relocalisation::{Relocalisation, Verdict};
+use crate::relocalisation::{Relocalisation, SearchState};
 use crate::sensor::scan::{Scan, ScanGeometry};
 use crate::tracking::correction::{Observability, Prior};
 use crate::tracking::tracker::Tracked;
@@ -65,9 +65,9 @@ impl Counters {
         add(&mut self.odometry_left_out, u32::from(update.odometry_left_out));
         add(&mut self.searched, u32::from(update.searched));
         add(&mut self.lost, u32::from(update.state == TrackingState::Lost));
-        let verdict = update.relocalisation.map(|r| r.verdict);
-        add(&mut self.relocalised, u32::from(verdict == Some(Verdict::Found)));
-        add(&mut self.gave_up, u32::from(verdict == Some(Verdict::GivenUp)));
+        let search = update.relocalisation.map(|r| r.state);
+        add(&mut self.relocalised, u32::from(search == Some(SearchState::Found)));
+        add(&mut self.gave_up, u32::from(search == Some(SearchState::GivenUp)));
     }
 }
 

@@ -2,6 +2,9 @@
 
 #![allow(clippy::disallowed_methods)]
 
+mod common;
+
+use common::{BEAMS, Wall, ranges_mm};
 use nalgebra::{Isometry2, Point2, Vector2};
 use proptest::prelude::*;
 use slam_core::geometry::pose::{components, pose};
@@ -10,8 +13,6 @@ use slam_core::odometry::track::{SWEEP_KNOTS, ScanMotion};
 use slam_core::slam::ScanRejection;
 use slam_core::tracking::correction::Verdict;
 use slam_core::{Scan, Slam, SlamConfig};
-
-const BEAMS: usize = 682;
 
 fn configs() -> [SlamConfig; 4] {
     [SlamConfig::default(), SlamConfig::paper(), SlamConfig::paper_weighted(), SlamConfig::paper_partial()]
@@ -26,7 +27,7 @@ fn moved(before_from_after: Isometry2<f32>) -> ScanMotion {
 }
 
 /// Both ends of each wall of a room of 6 m by 4.4 m with a box in it.
-fn room() -> Vec<((f32, f32), (f32, f32))> {
+fn room() -> Vec<Wall> {
     let corners = [(-2.0, -2.2), (4.0, -2.2), (4.0, 2.2), (-2.0, 2.2)];
     let block = [(1.4, -2.2), (1.4, -1.2), (2.2, -1.2), (2.2, -2.2)];
     let walls = (0..4).map(|i| (corners[i], corners[(i + 1) % 4]));
@@ -35,24 +36,7 @@ fn room() -> Vec<((f32, f32), (f32, f32))> {
 
 /// Ranges in that room, seen from `map_from_base`.
 fn room_scan(config: &SlamConfig, map_from_base: &Isometry2<f32>) -> Vec<u16> {
-    let walls = room();
-    let map_from_laser = map_from_base * config.sensor.mounting.base_from_laser;
-    (0..BEAMS)
-        .map(|beam| {
-            let bearing = config.sensor.geometry.bearing(beam);
-            let direction = map_from_laser.rotation * Vector2::new(bearing.cos(), bearing.sin());
-            let cross = |a: Vector2<f32>, b: Vector2<f32>| a.x * b.y - a.y * b.x;
-            let hits = walls.iter().filter_map(|&((x1, y1), (x2, y2))| {
-                let from = Point2::new(x1, y1) - Point2::from(map_from_laser.translation.vector);
-                let along = Vector2::new(x2 - x1, y2 - y1);
-                let denominator = cross(direction, along);
-                let (range, share) = (cross(from, along) / denominator, cross(from, direction) / denominator);
-                ((0.0..=1.0).contains(&share) && range > 0.02).then_some(range)
-            });
-            let range = hits.fold(f32::INFINITY, f32::min);
-            if range < 5.6 { (range * 1000.0).round() as u16 } else { 0 }
-        })
-        .collect()
+    ranges_mm(&room(), config, map_from_base, 5.6)
 }
 
 /// Distance of a point from the nearest wall of the room.

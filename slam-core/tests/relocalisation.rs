@@ -2,16 +2,19 @@
 
 #![allow(clippy::disallowed_methods)]
 
-use nalgebra::{Isometry2, Point2, Vector2};
+mod common;
+
+use common::{Wall, ranges_mm};
+use nalgebra::{Isometry2, Point2};
 use slam_core::geometry::pose::pose;
 use slam_core::map::store::{StoredLine, StoredLoop, StoredMap, StoredPlace};
 use slam_core::odometry::Increment;
-use slam_core::relocalisation::Verdict;
+use slam_core::relocalisation::SearchState;
 use slam_core::tracking::TrackingState;
 use slam_core::{Scan, ScanMotion, Slam, SlamConfig, SlamUpdate};
 
-const BEAMS: usize = 682;
-type Wall = ((f32, f32), (f32, f32));
+/// How far the scanner sees, metres.
+const REACH_M: f32 = 4.0;
 
 /// A room of 5 m by 4 m whose lower left corner is there, with a cupboard, a shelf askew and a recess; its door leads down.
 fn room(x: f32, y: f32) -> Vec<Wall> {
@@ -41,25 +44,6 @@ fn twins() -> Vec<Wall> {
     walls
 }
 
-fn ranges_mm(walls: &[Wall], config: &SlamConfig, map_from_base: &Isometry2<f32>) -> Vec<u16> {
-    let map_from_laser = map_from_base * config.sensor.mounting.base_from_laser;
-    let cross = |a: Vector2<f32>, b: Vector2<f32>| a.x * b.y - a.y * b.x;
-    let range_mm = |beam| {
-        let bearing = config.sensor.geometry.bearing(beam);
-        let direction = map_from_laser.rotation * Vector2::new(bearing.cos(), bearing.sin());
-        let hits = walls.iter().filter_map(|&((x1, y1), (x2, y2))| {
-            let from = Point2::new(x1, y1) - Point2::from(map_from_laser.translation.vector);
-            let along = Vector2::new(x2 - x1, y2 - y1);
-            let denominator = cross(direction, along);
-            let (range, share) = (cross(from, along) / denominator, cross(from, direction) / denominator);
-            ((0.0..=1.0).contains(&share) && range > 0.02).then_some(range)
-        });
-        let range = hits.fold(f32::INFINITY, f32::min);
-        if range < 4.0 { (range * 1000.0).round() as u16 } else { 0 }
-    };
-    (0..BEAMS).map(range_mm).collect()
-}
-
 struct Drive {
     walls: Vec<Wall>,
     config: SlamConfig,
@@ -76,7 +60,7 @@ impl Drive {
 
     fn step(&mut self, motion: Isometry2<f32>) -> SlamUpdate {
         self.truth *= motion;
-        let ranges_mm = ranges_mm(&self.walls, &self.config, &self.truth);
+        let ranges_mm = ranges_mm(&self.walls, &self.config, &self.truth, REACH_M);
         let motion = ScanMotion::instantaneous(Increment::from_motion(motion));
         self.slam.process_scan(&Scan { ranges_mm: &ranges_mm }, &motion)
     }
@@ -107,7 +91,7 @@ impl Drive {
 }
 
 fn found(updates: &[SlamUpdate]) -> Option<usize> {
-    updates.iter().position(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::Found))
+    updates.iter().position(|u| u.relocalisation.is_some_and(|r| r.state == SearchState::Found))
 }
 
 #[test]
@@ -148,8 +132,8 @@ fn in_two_rooms_alike_it_is_not_sure_until_it_has_left() {
     let inside = [drive.to(6.5, 4.5), drive.to(8.2, 4.2), drive.to(7.5, 2.8)].concat();
     assert_eq!(found(&inside), None, "nothing in there tells which it is");
     assert_eq!(drive.slam.state(), TrackingState::Lost);
-    let guesses = drive.slam.guesses().iter().filter(|g| g.support > 0.8).count();
-    assert!(guesses >= 2, "{guesses}");
+    let hypotheses = drive.slam.pose_hypotheses().iter().filter(|g| g.support > 0.8).count();
+    assert!(hypotheses >= 2, "{hypotheses}");
     let outside = [drive.to(7.5, 0.75), drive.to(8.2, 0.75), drive.to(7.0, 0.75)].concat();
     assert!(found(&outside).is_some() && drive.off().0 < 0.1, "{:?}", drive.off());
 }
@@ -169,10 +153,10 @@ fn where_nothing_has_been_mapped_it_goes_on_in_the_end() {
         updates.extend(drive.to(1.0, 50.7));
     }
     let last = updates.iter().rev().find_map(|u| u.relocalisation).expect("it was lost");
-    assert_eq!((last.verdict, found(&updates)), (Verdict::GivenUp, None));
-    let given_up = updates.iter().find(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::GivenUp));
+    assert_eq!((last.state, found(&updates)), (SearchState::GivenUp, None));
+    let given_up = updates.iter().find(|u| u.relocalisation.is_some_and(|r| r.state == SearchState::GivenUp));
     assert_eq!(given_up.map(|u| u.state), Some(TrackingState::Uncertain));
-    assert_eq!((drive.slam.counters().gave_up, drive.slam.guesses().len()), (1, 0));
+    assert_eq!((drive.slam.counters().gave_up, drive.slam.pose_hypotheses().len()), (1, 0));
 }
 
 #[test]
@@ -275,19 +259,20 @@ fn motions_that_are_no_numbers_and_scans_that_are_none_are_survived() {
     }
     drive.slam.relocalise();
     drive.stand(3);
-    assert!(!drive.slam.guesses().is_empty());
+    assert!(!drive.slam.pose_hypotheses().is_empty());
     let mut broken = ScanMotion::instantaneous(Increment::identity());
     broken.since_previous.before_from_after.translation.x = f32::NAN;
-    let ranges_mm = ranges_mm(&drive.walls, &drive.config, &drive.truth);
+    let ranges_mm = ranges_mm(&drive.walls, &drive.config, &drive.truth, REACH_M);
     drive.slam.process_scan(&Scan { ranges_mm: &ranges_mm }, &broken);
     drive.slam.process_scan(&Scan { ranges_mm: &[] }, &broken);
-    // What is coasted on while scans stay away moves the guesses too.
+    // What is coasted on while scans stay away moves the hypotheses too.
     drive.stand(3);
     drive.truth *= pose(0.2, 0.0, 0.1);
     drive.slam.coast(&Increment::from_motion(pose(0.2, 0.0, 0.1)));
-    let guessed = |drive: &Drive| drive.slam.guesses().iter().any(|g| g.scans > 0 && g.support > 0.8);
+    let is_known =
+        |drive: &Drive| drive.slam.pose_hypotheses().iter().any(|g| g.scans > 0 && g.support > 0.8);
     drive.stand(1);
-    assert!(guessed(&drive));
+    assert!(is_known(&drive));
     let driving = [drive.to(2.5, 1.0), drive.to(3.5, 1.0)].concat();
     assert!(found(&driving).is_some() && drive.off().0 < 0.05, "{:?}", drive.off());
 }

@@ -19,6 +19,9 @@ pub struct Walls {
 /// Way that counts as one pass, too short to have come back, metres.
 pub const PASS_M: f32 = 10.0;
 
+/// What was seen farther off says how well headings are known rather than how walls lie; it is left out, metres.
+const FARTHEST_M: f32 = 20.0;
+
 /// The walls of a replay's scans, laid by these poses. Not a number where the poses are of another time.
 pub fn walls(log: &Log, replay: &Replay, poses: &[StampedPose]) -> Walls {
     let steps = &replay.steps;
@@ -30,7 +33,8 @@ pub fn walls(log: &Log, replay: &Replay, poses: &[StampedPose]) -> Walls {
         .enumerate()
         .map(|(k, (step, pose))| {
             let seen = seen(log, replay, k);
-            let laid = seen.obstacles().map(|point| pose * nalgebra::convert::<_, Point2<f64>>(point));
+            let near = seen.obstacles().filter(|point| point.coords.norm() < FARTHEST_M);
+            let laid = near.map(|point| pose * nalgebra::convert::<_, Point2<f64>>(point));
             ((step.update.way_m / PASS_M) as u32, laid.collect())
         })
         .collect();

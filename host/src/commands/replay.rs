@@ -60,7 +60,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if args.map.is_some() && args.config != Configuration::Default {
         return Err(MapFileError::Configuration(args.config.name()).into());
     }
-    let map = args.map.as_deref().map(|path| MapFile::load(path, args.start)).transpose()?;
+    let map = args.map.as_deref().map(MapFile::load).transpose()?;
     let start = Start { map, pose: args.start, frozen: args.localise };
     // A given robot file is checked first: its beams are what the log must have.
     let given = args.robot.as_deref().map(Robot::load).transpose()?;

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 use slam_core::SlamUpdate;
-use slam_core::relocalisation::Verdict;
+use slam_core::relocalisation::SearchState;
 use slam_core::tracking::TrackingState;
 
 use crate::replay::Step;
@@ -48,8 +48,8 @@ impl Tracking {
             uncertain: counted(|u| u.state == TrackingState::Uncertain).0,
             lost,
             first_lost_s,
-            relocalised: counted(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::Found)).0,
-            gave_up: counted(|u| u.relocalisation.is_some_and(|r| r.verdict == Verdict::GivenUp)).0,
+            relocalised: counted(|u| u.relocalisation.is_some_and(|r| r.state == SearchState::Found)).0,
+            gave_up: counted(|u| u.relocalisation.is_some_and(|r| r.state == SearchState::GivenUp)).0,
             odometry_left_out,
             first_left_out_s,
             odometry_useless,

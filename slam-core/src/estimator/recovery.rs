@@ -1,7 +1,5 @@
 //! Beginning at a pose, and going on after a reset.
 
-use nalgebra::{Isometry2, Matrix3};
-
 use super::Estimator;
 use crate::config::SlamConfig;
 use crate::ekf::keyframe::{Keyframe, LocalVariance};
@@ -11,22 +9,8 @@ use crate::map::store::StoredMap;
 use crate::tracking::correction::Prior;
 
 impl Estimator {
-    /// Begins anew at a pose that is taken as certain.
-    pub fn begin_at(&mut self, map_from_base: Isometry2<f32>, config: &SlamConfig) {
-        self.map_from_base = map_from_base;
-        self.restart_way();
-        self.local_covariance = Matrix3::zeros();
-        self.begin_anew(config);
-    }
-
-    /// Begins anew in a map that was saved.
-    pub fn begin_in<const N: usize>(
-        &mut self,
-        saved: &StoredMap<'_>,
-        at: &Prior,
-        config: &SlamConfig,
-        map: &mut SegmentMap<N>,
-    ) {
+    /// Takes over what a saved map knows of odometry and way. To be followed by [`Self::restart`].
+    pub fn take_over(&mut self, saved: &StoredMap<'_>, config: &SlamConfig) {
         if let Some(filter) = self.filter.as_mut().filter(|_| config.odometry.bias.is_some()) {
             filter.set_bias(saved.odometry_bias);
         }
@@ -35,7 +19,6 @@ impl Estimator {
             self.scans = self.scans.max(ekf.keyframes.at_start.saturating_add(1));
         }
         self.travelled_m = saved.way_m;
-        self.restart(at, config, map);
     }
 
     /// Begins anew at a pose with a covariance.
@@ -49,6 +32,13 @@ impl Estimator {
         }
         self.keyframe.local_variance = LocalVariance::of(&at.covariance);
         self.set_anchor();
+    }
+
+    /// In a map that stays as it is: where a keyframe would be due, the pose alone is taken for what the filter knows.
+    pub fn follow<const N: usize>(&mut self, config: &SlamConfig, map: &mut SegmentMap<N>) {
+        if self.keyframe_is_due(&config.registration) {
+            self.restart(&self.local(), config, map);
+        }
     }
 
     /// Begins anew from where the robot stands. Of the filter only the odometry's errors stay.

@@ -80,21 +80,6 @@ pub fn wrap_angle(angle_rad: f32) -> f32 {
     if wrapped <= -PI || wrapped > PI { PI } else { wrapped }
 }
 
-/// Sorts a few dozen items, least key first; those of the same key stay in their order. By insertion: the standard library's sort is 4 kB of
-/// flash for each kind of item.
-///
-/// Work: half the square of their number, where they are in no order.
-pub fn sort_few<T>(items: &mut [T], key: impl Fn(&T) -> f32) {
-    for end in 1..items.len() {
-        for at in (1..=end).rev() {
-            match items.get(at - 1..=at) {
-                Some([before, own]) if key(own) < key(before) => items.swap(at - 1, at),
-                _ => break,
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -110,14 +95,6 @@ mod tests {
             let (s, c) = sin_cos(quarter as f32 * core::f32::consts::FRAC_PI_2);
             assert!((s * s + c * c - 1.0).abs() < 3e-7 && s.abs().min(c.abs()) < 2e-6, "{quarter}");
         }
-    }
-
-    #[test]
-    fn a_few_are_sorted_and_equals_stay_in_order() {
-        let mut items = [(3.0, 'a'), (-1.0, 'b'), (3.0, 'c'), (f32::INFINITY, 'd'), (0.5, 'e'), (-1.0, 'f')];
-        sort_few(&mut items, |item| item.0);
-        assert_eq!(items.map(|item| item.1), ['b', 'f', 'e', 'a', 'c', 'd']);
-        sort_few(&mut [0.0f32; 0], |item| *item);
     }
 
     #[test]

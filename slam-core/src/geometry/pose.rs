@@ -108,6 +108,17 @@ pub fn rotate_covariance(rotation: &Isometry2<f32>, covariance: &Matrix3<f32>) -
     turn * covariance * turn.transpose()
 }
 
+/// Covariance (x, y, θ) of independent errors, by their standard deviations (m, m, rad).
+pub(crate) fn diagonal(sigmas: [f32; 3]) -> Matrix3<f32> {
+    Matrix3::from_diagonal(&Vector3::from(sigmas.map(|sigma| sigma * sigma)))
+}
+
+/// Whether two poses lie closer together than this, metres, and are turned by less from each other, radians.
+pub(crate) fn are_close(a: &Isometry2<f32>, b: &Isometry2<f32>, [position_m, heading_rad]: [f32; 2]) -> bool {
+    let off = components(&a.inv_mul(b));
+    off.xy().norm() < position_m && off.z.abs() < heading_rad
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -30,7 +30,7 @@ pub struct StoredLine {
     pub start_m: [f32; 2],
     /// … and where it ends.
     pub end_m: [f32; 2],
-    /// So far from its start, metres, …
+    /// So far from its start, metres (beyond its ends where it is what an opening left of a longer line), …
     pub middle_m: f32,
     /// … its distance has this standard deviation, metres, …
     pub sigma_offset_m: f32,
@@ -68,9 +68,8 @@ impl StoredLine {
         let length_m = sqrt((end - start).norm_squared());
         let sigmas = [self.sigma_offset_m, self.sigma_direction_rad];
         let makes_sense = length_m > 0.0
-            && [ax, ay, bx, by, self.seen_at_m].iter().all(|v| v.abs() < FARTHEST_M)
-            && sigmas.iter().all(|sigma| (LEAST_SIGMA..MOST_SIGMA).contains(sigma))
-            && (-length_m..2.0 * length_m).contains(&self.middle_m);
+            && [ax, ay, bx, by, self.middle_m, self.seen_at_m].iter().all(|v| v.abs() < FARTHEST_M)
+            && sigmas.iter().all(|sigma| (LEAST_SIGMA..MOST_SIGMA).contains(sigma));
         if !makes_sense {
             return None;
         }
@@ -280,6 +279,15 @@ mod tests {
         let along = |entry: &MapSegment| entry.segment.moments.scatter_along(entry.segment.direction);
         assert!((along(&back) / along(&entry) - 1.0).abs() < 1e-4);
         assert!((back.segment.moments.weight / entry.segment.moments.weight - 1.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn so_does_what_an_opening_left_of_a_line() {
+        let mut entry = line((0.0, 1.0), (5.0, 1.0), 7);
+        entry.segment.start.x = 4.8;
+        let back = StoredLine::of(&entry).entry().unwrap();
+        assert!((back.segment.moments.centroid - entry.segment.moments.centroid).norm() < 1e-5);
+        assert!((back.segment.length_m() - 0.2).abs() < 1e-5);
     }
 
     #[test]

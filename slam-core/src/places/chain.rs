@@ -4,7 +4,7 @@
 //! others, and is too small by an order of magnitude (with it loops are refused that are right).
 
 use heapless::Vec;
-use nalgebra::{Isometry2, Matrix3, Vector3};
+use nalgebra::{Isometry2, Matrix3};
 
 use super::lines::PlaceLines;
 use super::twist::adjoint;
@@ -138,11 +138,6 @@ impl<const P: usize> Chain<P> {
         self.anchors.push(Anchor { pose, from_previous, variances, way_m, lines }).is_ok()
     }
 
-    /// Adds an anchor as it was.
-    pub(super) fn restore(&mut self, anchor: Anchor) -> bool {
-        self.anchors.push(anchor).is_ok()
-    }
-
     /// The least informative anchor of those in the inside of the chain that are not `needed`: the one between the two that lie closest
     /// together along the way, or half as far where another place lies close by.
     pub(super) fn least_informative(&self, needed: impl Fn(usize) -> bool) -> Option<usize> {
@@ -206,11 +201,6 @@ impl<const P: usize> Chain<P> {
 /// Places as close as this, and as alike in heading, show the same.
 const NEAR_M2: f32 = 9.0;
 const NEAR_RAD: f32 = 0.8;
-
-/// Variances (x, y, θ) as a covariance.
-pub(crate) fn diagonal(sigmas: [f32; 3]) -> Matrix3<f32> {
-    Matrix3::from_diagonal(&Vector3::from(sigmas.map(|s| s * s)))
-}
 
 #[cfg(test)]
 mod tests {

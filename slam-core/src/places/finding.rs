@@ -9,14 +9,15 @@ use heapless::Vec;
 use nalgebra::{Isometry2, Matrix3};
 
 use super::PlacesConfig;
-use super::chain::{Anchor, Chain, diagonal};
+use super::chain::{Anchor, Chain};
 use super::factor::{LOOPS, ROWS, set_three};
 use super::lines::unpacked;
 use super::matching::{Gate, Match, matched};
 use super::solver::{Loop, Solver};
 use super::twist::{Packed, inverse_adjoint};
-use crate::geometry::math::{sort_few, sqrt};
-use crate::geometry::pose::components;
+use crate::few::sort_few;
+use crate::geometry::math::sqrt;
+use crate::geometry::pose::{components, diagonal};
 
 /// Old places looked at for each new one.
 const CANDIDATES: usize = 8;

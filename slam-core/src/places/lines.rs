@@ -5,7 +5,8 @@
 use heapless::Vec;
 use nalgebra::{Isometry2, Point2, Vector2};
 
-use crate::geometry::math::{atan2, max, min, sort_few, sqrt};
+use crate::few::{keep_most, sort_few};
+use crate::geometry::math::{atan2, max, min, sqrt};
 use crate::geometry::pose::{cross, perpendicular};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
@@ -108,12 +109,8 @@ const AROUND: usize = 48;
 
 /// The longest lines of the map of which a point lies within `reach_m` of a pose, in its frame, sorted by direction. Work: a pass over the map.
 pub(super) fn around(map: &[MapSegment], at: &Isometry2<f32>, reach_m: f32) -> Vec<Ray, AROUND> {
-    let is_near = |segment: &Segment| {
-        let nearest = segment.nearest_to(at.translation.vector.into());
-        (nearest.coords - at.translation.vector).norm_squared() <= reach_m * reach_m
-    };
     let known = map.iter().filter(|entry| entry.hits >= LEAST_HITS).map(|entry| &entry.segment);
-    let longest = longest::<AROUND>(known.filter(|segment| is_near(segment)));
+    let longest = longest::<AROUND>(known.filter(|segment| is_within(segment, at, reach_m)));
     let place_from_map = at.inverse();
     let in_place = |segment: &&Segment| ray(place_from_map * segment.start, place_from_map * segment.end);
     let mut rays: Vec<Ray, AROUND> = longest.iter().filter_map(in_place).collect();
@@ -129,11 +126,7 @@ fn longest<'a, const N: usize>(segments: impl Iterator<Item = &'a Segment>) -> V
         if segment.length_m() < least_m {
             continue;
         }
-        if longest.push(segment).is_err()
-            && let Some(least) = longest.iter_mut().min_by(|a, b| a.length_m().total_cmp(&b.length_m()))
-        {
-            *least = segment;
-        }
+        keep_most(&mut longest, segment, |segment| segment.length_m());
         if longest.is_full() {
             least_m = longest.iter().map(|s| s.length_m()).fold(f32::INFINITY, min);
         }
@@ -169,13 +162,7 @@ pub(super) fn chosen(
             continue;
         }
         let worth = min(entry.segment.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS));
-        let candidate = (index as u16, worth);
-        if candidates.push(candidate).is_err()
-            && let Some(least) = candidates.iter_mut().min_by(|a, b| a.1.total_cmp(&b.1))
-            && least.1 < worth
-        {
-            *least = candidate;
-        }
+        keep_most(&mut candidates, (index as u16, worth), |candidate| candidate.1);
     }
     let place_from_map = anchor.inverse();
     let mut taken: Vec<&Segment, PLACE_LINES> = Vec::new();
@@ -204,11 +191,15 @@ pub(super) fn chosen(
 
 /// Whether a line may be one of a place.
 fn is_of(entry: &MapSegment, anchor: &Isometry2<f32>) -> bool {
-    let segment = &entry.segment;
-    let nearest = segment.nearest_to(anchor.translation.vector.into());
     entry.hits >= LEAST_HITS
-        && segment.length_m() >= LEAST_LENGTH_M
-        && (nearest.coords - anchor.translation.vector).norm_squared() < REACH_M * REACH_M
+        && entry.segment.length_m() >= LEAST_LENGTH_M
+        && is_within(&entry.segment, anchor, REACH_M)
+}
+
+/// Whether a point of a segment lies within `reach_m` of a pose.
+fn is_within(segment: &Segment, at: &Isometry2<f32>, reach_m: f32) -> bool {
+    let nearest = segment.nearest_to(at.translation.vector.into());
+    (nearest.coords - at.translation.vector).norm_squared() < reach_m * reach_m
 }
 
 /// The ends of a line in a place's frame, none farther along it from the place's foot than [`REACH_M`].

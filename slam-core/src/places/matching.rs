@@ -12,8 +12,9 @@ use heapless::Vec;
 use nalgebra::{Isometry2, Matrix3, Point2, Vector2, Vector3};
 
 use super::lines::Ray;
-use crate::geometry::math::{max, min, sort_few, sqrt, within, wrap_angle};
-use crate::geometry::pose::{components, cross, heading, pose};
+use crate::few::{keep_most, sort_few};
+use crate::geometry::math::{max, min, sqrt, within, wrap_angle};
+use crate::geometry::pose::{are_close, components, cross, heading, pose};
 
 /// Lines at a smaller angle fix no pose together, as a sine.
 const LEAST_SINE: f32 = 0.5;
@@ -49,21 +50,6 @@ const SIGMA_M: f32 = 0.03;
 const HELD: [f32; 3] = [1.0, 1.0, 30.0];
 /// Poses farther apart than this, metres or radians, are others.
 const OTHER: [f32; 2] = [1.0, 0.175];
-
-/// Where nothing is known: poses that are kept of those proposed, …
-pub(super) const PROPOSED: usize = 4;
-/// … lines of the query whose ends propose some, …
-const BY_ENDS: usize = 3;
-/// … what a line must have of the length of what is seen of it, …
-const LEAST_SHARE_OF_LENGTH: f32 = 0.7;
-/// … how near lines must lie, metres and radians, …
-const NEAR_M: f32 = 0.25;
-const NEAR_RAD: f32 = 0.12;
-/// … what share of the query must do so, …
-const LEAST_EXPLAINED: f32 = 0.5;
-/// … and what is nearly the same, metres and radians.
-const SAME_M: f32 = 0.5;
-const SAME_RAD: f32 = 0.26;
 
 /// What the chain allows.
 #[derive(Clone, Copy, Debug)]
@@ -136,10 +122,7 @@ pub(super) fn matched(query: &[Ray], place: &[Ray], gate: &Gate) -> Option<Match
         }
     }
     let best = *found.iter().max_by(|a, b| a.share.total_cmp(&b.share))?;
-    let is_other = |m: &&Match| {
-        let off = components(&best.pose.inv_mul(&m.pose));
-        off.xy().norm() >= OTHER[0] || off.z.abs() >= OTHER[1]
-    };
+    let is_other = |m: &&Match| !are_close(&best.pose, &m.pose, OTHER);
     let runner_up = found.iter().filter(is_other).map(|m| m.share).fold(0.0, max);
     Some(Match { runner_up, ..best })
 }
@@ -202,114 +185,19 @@ fn vote([p, q]: [&Ray; 2], [a, b]: [&Ray; 2], gate: &Gate, cells: &mut Vec<Cell,
     if let Some(cell) = cells.iter_mut().find(|cell| cell.key == key) {
         cell.weight += weight;
         cell.sum += sum;
-    } else if let Err(cell) = cells.push(Cell { key, weight, sum })
-        && let Some(least) = cells.iter_mut().min_by(|a, b| a.weight.total_cmp(&b.weight))
-        && least.weight < weight
-    {
-        *least = cell;
-    }
-}
-
-/// Poses of `query`, longest lines first, among lines sorted by direction, whatever is known of where it is: those that explain most. Its
-/// longest lines propose them, by their ends.
-///
-/// Work: for each of [`BY_ENDS`] lines and each of the others two poses, most of which a look at some of the lines that run alike rules out.
-pub(super) fn anywhere(query: &[Ray], lines: &[Ray]) -> Vec<Isometry2<f32>, PROPOSED> {
-    let mut best: Vec<(Isometry2<f32>, f32), PROPOSED> = Vec::new();
-    let all_m: f32 = query.iter().map(|ray| ray.length_m).sum();
-    for seen in query.iter().take(BY_ENDS) {
-        // What is seen of a line is not longer than the line.
-        for there in lines.iter().filter(|there| there.length_m > LEAST_SHARE_OF_LENGTH * seen.length_m) {
-            let turn = wrap_angle(there.angle_rad - seen.angle_rad);
-            let rotation = pose(0.0, 0.0, turn).rotation;
-            for [to, from] in [[there.start, seen.start], [there.end, seen.end]] {
-                let at = Isometry2::from_parts((to - rotation * from).into(), rotation);
-                let worst = best.iter().map(|(_, explained_m)| *explained_m).fold(f32::INFINITY, min);
-                let least_m = max(LEAST_EXPLAINED * all_m, if best.is_full() { worst } else { 0.0 });
-                if let Some(explained_m) = explained_m(query, lines, &at, turn, least_m, all_m) {
-                    keep(at, explained_m, &mut best);
-                }
-            }
-        }
-    }
-    best.iter().map(|(pose, _)| *pose).collect()
-}
-
-/// Keeps a pose, of those that are nearly the same only the best, and of too many those that explain most.
-fn keep(at: Isometry2<f32>, explained_m: f32, best: &mut Vec<(Isometry2<f32>, f32), PROPOSED>) {
-    let is_same = |(other, _): &&mut (Isometry2<f32>, f32)| {
-        let off = components(&other.inv_mul(&at));
-        off.xy().norm_squared() < SAME_M * SAME_M && off.z.abs() < SAME_RAD
-    };
-    if let Some(same) = best.iter_mut().find(is_same) {
-        if same.1 < explained_m {
-            *same = (at, explained_m);
-        }
-    } else if best.push((at, explained_m)).is_err()
-        && let Some(least) = best.iter_mut().min_by(|a, b| a.1.total_cmp(&b.1))
-    {
-        *least = (at, explained_m);
-    }
-}
-
-/// Length of the lines of `query` that lie on some of `lines`, metres, if it is not less than `least_m`.
-fn explained_m(
-    query: &[Ray],
-    lines: &[Ray],
-    at: &Isometry2<f32>,
-    turn: f32,
-    least_m: f32,
-    all_m: f32,
-) -> Option<f32> {
-    let (mut explained_m, mut possible_m) = (0.0, all_m);
-    for seen in query {
-        let (a, b) = (at * seen.start, at * seen.end);
-        let mut sum = 0.0;
-        for there in alike(lines, wrap_angle(seen.angle_rad + turn)) {
-            let across = there.normal.dot(&(a.coords + b.coords)) - 2.0 * there.offset_m;
-            if across.abs() <= 2.0 * NEAR_M
-                && let Some(part) = shared(a, b, there)
-            {
-                sum += part.length_m;
-            }
-        }
-        let own_m = min(sum, seen.length_m);
-        explained_m += own_m;
-        possible_m -= seen.length_m - own_m;
-        if possible_m < least_m {
-            return None;
-        }
-    }
-    Some(explained_m)
-}
-
-/// Of lines sorted by direction those that run within [`NEAR_RAD`] of one.
-fn alike(lines: &[Ray], angle_rad: f32) -> impl Iterator<Item = &Ray> {
-    let range = |from: f32, to: f32| {
-        let begin = lines.partition_point(|ray| ray.angle_rad < from);
-        let end = lines.partition_point(|ray| ray.angle_rad <= to);
-        lines.get(begin..end).unwrap_or_default()
-    };
-    const TURN: f32 = 2.0 * core::f32::consts::PI;
-    let (from, to) = (angle_rad - NEAR_RAD, angle_rad + NEAR_RAD);
-    let around = if from < -core::f32::consts::PI {
-        range(from + TURN, f32::INFINITY)
-    } else if to > core::f32::consts::PI {
-        range(f32::NEG_INFINITY, to - TURN)
     } else {
-        &[]
-    };
-    range(from, to).iter().chain(around)
+        keep_most(cells, Cell { key, weight, sum }, |cell| cell.weight);
+    }
 }
 
 /// The part of two lines that lies side by side: both ends of it on the first, their distances from the second, and its length.
-struct Shared {
+pub(super) struct Shared {
     ends: [Point2<f32>; 2],
     distances: [f32; 2],
-    length_m: f32,
+    pub length_m: f32,
 }
 
-fn shared(start: Point2<f32>, end: Point2<f32>, there: &Ray) -> Option<Shared> {
+pub(super) fn shared(start: Point2<f32>, end: Point2<f32>, there: &Ray) -> Option<Shared> {
     let along = |point: Point2<f32>| there.direction.dot(&(point - there.start));
     let across = |point: Point2<f32>| there.normal.dot(&point.coords) - there.offset_m;
     let (from, to) = (along(start), along(end));
@@ -371,11 +259,11 @@ fn refined(query: &[Ray], place: &[Ray], start: Isometry2<f32>) -> Match {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
+    use crate::geometry::pose::diagonal;
     use crate::map::MapSegment;
     use crate::map::fixtures::line;
-    use crate::places::chain::diagonal;
     use crate::places::lines::{chosen, unpacked};
 
     fn wall(from: (f32, f32), to: (f32, f32)) -> MapSegment {
@@ -383,7 +271,7 @@ mod tests {
     }
 
     /// A room with a recess, a pillar and a table that stands askew.
-    fn room() -> std::vec::Vec<MapSegment> {
+    pub fn room() -> std::vec::Vec<MapSegment> {
         let corners: [(f32, f32); 8] =
             [(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (4.0, 4.0), (4.0, 5.5), (2.5, 5.5), (2.5, 4.0), (0.0, 4.0)];
         let mut walls: std::vec::Vec<_> = (0..8).map(|k| wall(corners[k], corners[(k + 1) % 8])).collect();
@@ -437,23 +325,5 @@ mod tests {
         );
         let found = matched(&query, &place, &gate(pose(0.0, 0.0, 0.0), [2.0, 2.0, 0.1])).unwrap();
         assert!(found.runner_up > 0.8 * found.share, "{found:?}");
-    }
-    #[test]
-    fn without_a_gate_the_true_pose_is_among_those_proposed() {
-        let map = room();
-        let there = pose(3.0, 2.0, 0.3);
-        let lines = crate::places::lines::around(&map, &there, 10.0);
-        assert_eq!(lines.len(), map.len());
-        assert!(lines.is_sorted_by(|a, b| a.angle_rad <= b.angle_rad));
-        for here in [pose(2.0, 2.5, 0.3), pose(4.0, 1.0, -2.5), pose(1.5, 3.0, 1.2), pose(5.0, 2.0, 3.1)] {
-            let seen: std::vec::Vec<_> = map.iter().map(|e| e.segment.transformed(&here.inverse())).collect();
-            let proposed = anywhere(&crate::places::of_scan(&seen), &lines);
-            let truth = there.inv_mul(&here);
-            let off = |at: &Isometry2<f32>| components(&truth.inv_mul(at)).norm();
-            assert!(proposed.iter().any(|at| off(at) < 0.01), "{here} {proposed:?}");
-        }
-        assert!(anywhere(&[], &lines).is_empty());
-        let short = crate::places::of_scan(&[map[4].segment.transformed(&there.inverse())]);
-        assert!(!anywhere(&short, &lines).is_empty() && anywhere(&short, &[]).is_empty());
     }
 }

@@ -16,6 +16,8 @@ mod factor;
 mod finding;
 mod lines;
 mod matching;
+mod recognition;
+mod saved;
 pub mod solver;
 mod twist;
 
@@ -26,17 +28,16 @@ use crate::config::{Checked, not_negative};
 use crate::geometry::math::within;
 use crate::geometry::pose::{heading, normalized, pose, turn};
 use crate::map::MapSegment;
-use crate::map::store::{StoredLoop, StoredPlace};
 use crate::map::walls::WallConfig;
 use crate::odometry::Increment;
 use crate::tracking::correction::Verdict;
 use chain::Support;
-pub(crate) use chain::diagonal;
 pub use chain::{Anchor, Chain};
 pub use factor::LOOPS;
 use finding::{Finder, Known};
 pub use lines::{PLACE_LINES, PlaceLine};
 pub(crate) use lines::{Ray, of_scan};
+pub(crate) use recognition::SAME;
 pub use solver::Loop;
 use solver::{Progress, Solver};
 
@@ -189,49 +190,9 @@ impl<const P: usize> Places<P> {
         (self.is_moving, self.has_jumped) = (false, false);
     }
 
-    /// Puts in order what a reset may have left half done. Where places were moving, or one was half written, all are forgotten: the map
-    /// is whole without them.
-    pub(crate) fn recover(&mut self) {
-        let anchors = self.chain.anchors();
-        let is_whole = |anchor: &Anchor| StoredPlace::of(anchor).anchor().is_some();
-        // A robot that turns on the spot has places of the same way, but not the same place twice.
-        let in_order = anchors.is_sorted_by(|before, after| {
-            before.way_m < after.way_m || (before.way_m == after.way_m && before.pose != after.pose)
-        });
-        let loops = self.loops.iter().all(|edge| StoredLoop::of(edge).edge(anchors.len()).is_some());
-        if self.is_moving || !in_order || !loops || !anchors.iter().all(is_whole) {
-            self.clear();
-            return;
-        }
-        self.solver.clear();
-        self.finder = Finder::new();
-        (self.is_stale, self.without_lines) = (!self.loops.is_empty(), 0);
-        self.pass_lost();
-    }
-
     /// All that was to move with a [`Closure`] has.
     pub(crate) fn moved_all(&mut self) {
         self.is_moving = false;
-    }
-
-    /// Takes places and loops as they were. False where there is no room, and then there are none.
-    pub(crate) fn restore(
-        &mut self,
-        anchors: impl Iterator<Item = Anchor>,
-        loops: impl Iterator<Item = Loop>,
-    ) -> bool {
-        self.clear();
-        let mut fits = true;
-        anchors.for_each(|anchor| fits &= self.chain.restore(anchor));
-        loops.for_each(|edge| fits &= self.loops.push(edge).is_ok());
-        if !fits {
-            self.clear();
-        }
-        // The posterior is that of a solution.
-        self.is_stale = !self.loops.is_empty();
-        let waiting = self.chain.anchors.iter().rev().take_while(|anchor| anchor.lines.is_empty());
-        self.without_lines = waiting.take(2).count() as u8;
-        fits
     }
 
     /// The places.
@@ -391,7 +352,7 @@ impl<const P: usize> Places<P> {
     /// Poses in `map` from which a robot near a place may see these lines, longest first: the best few, whatever is known of where it
     /// is.
     ///
-    /// Work: that of [`matching::anywhere`].
+    /// Work: that of [`recognition::anywhere`].
     pub(crate) fn poses_of(
         &self,
         place: usize,
@@ -402,7 +363,7 @@ impl<const P: usize> Places<P> {
         let anchor = self.chain.get(place);
         let pose = anchor.map_or_else(Isometry2::identity, Anchor::pose);
         let found = anchor
-            .map(|anchor| matching::anywhere(seen, &lines::around(map, &anchor.pose, reach_m + BESIDE_M)));
+            .map(|anchor| recognition::anywhere(seen, &lines::around(map, &anchor.pose, reach_m + BESIDE_M)));
         found.into_iter().flatten().map(move |found| normalized(&(pose * found)))
     }
 

@@ -6,6 +6,7 @@ use super::Slam;
 use crate::map::MapSegment;
 use crate::odometry::Increment;
 use crate::relocalisation::Relocaliser;
+use crate::tracking::correction::Prior;
 
 impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// Moves the robot by odometry alone, where no scan has come.
@@ -22,9 +23,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     /// counted as refused.
     pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {
         self.map.take_up(map.iter().map(|entry| MapSegment { seen_at_m: 0.0, ..*entry }));
-        self.estimator.begin_at(map_from_base, &self.config);
         self.places.clear();
-        self.begin_anew();
+        self.jump(&Prior { pose: map_from_base, covariance: Matrix3::zeros() });
     }
 
     /// Makes the pose less sure by a covariance of (x, y, θ) in `map`: the robot may have moved unseen.

@@ -1,10 +1,10 @@
 //! A robot that was displaced looks for itself in its map.
 
 use super::Slam;
+use crate::geometry::pose::diagonal;
 use crate::odometry::Increment;
 use crate::odometry::track::ScanMotion;
-use crate::places::diagonal;
-use crate::relocalisation::{Evidence, Guess, Relocaliser, Verdict};
+use crate::relocalisation::{Evidence, PoseHypothesis, Relocaliser, SearchState};
 use crate::sensor::scan::Scan;
 use crate::tracking::correction::Prior;
 use crate::tracking::tracker::Scene;
@@ -26,8 +26,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
     }
 
     /// Where a robot may be that is looking for itself.
-    pub fn guesses(&self) -> &[Guess] {
-        self.relocaliser.guesses()
+    pub fn pose_hypotheses(&self) -> &[PoseHypothesis] {
+        self.relocaliser.hypotheses()
     }
 
     /// Whether the pose is not tracked, but looked for.
@@ -53,8 +53,7 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         update: &mut SlamUpdate,
         watch: &mut impl FnMut(Stage),
     ) {
-        let Self { config, map, estimator, frontend, tracker, places, odometry, relocaliser, state, .. } =
-            self;
+        let Self { config, map, estimator, frontend, tracker, places, odometry, relocaliser, .. } = self;
         let Some(settings) = &config.relocalisation else { return };
         let scene = Scene { observed: frontend.segments(), map: map.segments(), config };
         let motion = &motion.since_previous;
@@ -62,9 +61,9 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         let predicted = |at: &Prior| estimator.predicted(at, motion, odometry, config);
         let outcome = relocaliser.step(&evidence, tracker, predicted, settings, watch);
         update.relocalisation = Some(outcome);
-        let at = match (outcome.verdict, outcome.best) {
-            (Verdict::Found, Some(found)) => found.prior(),
-            (Verdict::GivenUp, _) => {
+        let at = match (outcome.state, outcome.best) {
+            (SearchState::Found, Some(found)) => found.prior(),
+            (SearchState::GivenUp, _) => {
                 let Prior { pose, covariance } = estimator.local();
                 Prior { pose, covariance: covariance + diagonal(THOUGHT) }
             }
@@ -75,14 +74,19 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         };
         let hypothesis = tracker.refined_at(&scene, &at, watch);
         update.take_pose(&hypothesis);
-        let at = Prior { pose: hypothesis.pose, covariance: hypothesis.covariance };
-        estimator.restart(&at, config, map);
-        places.pass_lost();
-        odometry.map_moved();
-        *relocaliser = Relocaliser::new();
-        match outcome.verdict {
-            Verdict::GivenUp => state.give_up(),
-            _ => state.found(),
+        self.jump(&Prior { pose: hypothesis.pose, covariance: hypothesis.covariance });
+        if outcome.state == SearchState::GivenUp {
+            self.state.give_up();
         }
+    }
+
+    /// The robot goes on from a pose: what was known of the way there says nothing of it.
+    pub(super) fn jump(&mut self, to: &Prior) {
+        let Self { config, estimator, map, .. } = self;
+        estimator.restart(to, config, map);
+        self.places.pass_lost();
+        self.odometry.map_moved();
+        self.relocaliser = Relocaliser::new();
+        self.state.found();
     }
 }

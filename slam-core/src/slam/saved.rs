@@ -4,9 +4,9 @@ use nalgebra::Isometry2;
 
 use super::Slam;
 use super::relocation::THOUGHT;
+use crate::geometry::pose::diagonal;
 use crate::map::store::{MapError, StoredLine, StoredLoop, StoredMap, StoredPlace};
-use crate::places::{LOOPS, diagonal};
-use crate::relocalisation::Relocaliser;
+use crate::places::LOOPS;
 use crate::tracking::correction::Prior;
 
 impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
@@ -45,22 +45,13 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         let anchors = map.places.iter().filter_map(StoredPlace::anchor);
         let loops = map.loops.iter().filter_map(|edge| edge.edge(map.places.len()));
         self.places.restore(anchors, loops);
-        let Self { config, estimator, map: lines, .. } = self;
+        self.estimator.take_over(map, &self.config);
         let pose = at.unwrap_or_else(Isometry2::identity);
-        estimator.begin_in(map, &Prior { pose, covariance: diagonal(THOUGHT) }, config, lines);
-        self.begin_anew();
+        self.jump(&Prior { pose, covariance: diagonal(THOUGHT) });
         if at.is_none() {
             self.relocalise();
         }
         Ok(())
-    }
-
-    /// What was known of the way until now says nothing of the map there is now.
-    pub(super) fn begin_anew(&mut self) {
-        self.places.pass_lost();
-        self.odometry.map_moved();
-        self.relocaliser = Relocaliser::new();
-        self.state.found();
     }
 
     /// Whether the map learns from what is seen, as it does at first, or stays as it is, and the robot only finds its way in it.

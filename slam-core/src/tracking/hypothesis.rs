@@ -51,18 +51,21 @@ impl Hypothesis {
 /// Share of the observed inliers that the pairs explain: each segment counts by how well it lies on its map line,
 /// 1 − χ²/13.8, and, by half, by the share of it that lies within the map segment.
 ///
-/// Segments that do not count are left out, explained or not. χ² has the lines' variances and a fixed slack in it and nothing of the pose's: a pose that is less sure does not fit better.
+/// Segments that do not count, by their index, are left out, explained or not. χ² has the lines' variances and a fixed slack in it and
+/// nothing of the pose's: a pose that is less sure does not fit better.
 pub fn tight_score(
     observed: &[Segment],
     pairs: &[Pair],
     map: &[MapSegment],
     pose: &Isometry2<f32>,
     line_noise: &LineNoise,
-    counts: impl Fn(&Segment) -> bool,
+    counts: impl Fn(usize) -> bool,
 ) -> (f32, f32) {
-    let all: f32 = observed.iter().filter(|s| counts(s)).map(|s| s.moments.inliers as f32).sum();
+    let all: f32 =
+        observed.iter().enumerate().filter(|(k, _)| counts(*k)).map(|(_, s)| s.moments.inliers as f32).sum();
     let explained = |pair: &Pair| {
-        let (seen, entry) = (observed.get(pair.observed).filter(|s| counts(s))?, map.get(pair.mapped)?);
+        let (seen, entry) =
+            (observed.get(pair.observed).filter(|_| counts(pair.observed))?, map.get(pair.mapped)?);
         let in_map = seen.transformed(pose);
         let residual = Residual::new(&in_map, &entry.segment, pose.translation.vector.into(), line_noise)?;
         let covariance = residual.covariance + Matrix2::new(SLACK[0], 0.0, 0.0, SLACK[1]);

@@ -14,9 +14,11 @@ pub mod correction;
 mod evidence;
 pub mod heading_search;
 pub mod hypothesis;
+mod search;
 pub mod state;
 pub mod tracker;
 
 pub use hypothesis::Hypothesis;
+pub use search::SearchConfig;
 pub use state::{StateConfig, TrackingState};
-pub use tracker::{SearchConfig, Tracker};
+pub use tracker::Tracker;

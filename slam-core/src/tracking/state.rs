@@ -12,7 +12,7 @@ pub enum TrackingState {
     Tracking,
     /// Scans have been explained badly for a while: what they show enters the map late and sparsely.
     Uncertain,
-    /// The map contradicts what is seen, or nothing has been seen for long: nothing enters the map.
+    /// The robot was displaced, the map contradicts what is seen, or nothing has been seen for long: nothing enters the map.
     Lost,
 }
 
@@ -64,7 +64,7 @@ const LEAST_EXPECTED: f32 = 0.7;
 const EXPECTED_SHARE: f32 = 0.2;
 
 /// The state and what it is judged by.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct StateMonitor {
     state: TrackingState,
     good: u8,
@@ -79,22 +79,6 @@ pub struct StateMonitor {
     missing_m: f32,
     /// The robot is lost, and not only because there was nothing to see.
     displaced: bool,
-}
-
-impl Default for StateMonitor {
-    fn default() -> Self {
-        Self {
-            state: TrackingState::Tracking,
-            good: 0,
-            bad: 0,
-            contradicted: 0,
-            blind_way_m: 0.0,
-            expected: 0.0,
-            missing: 0.0,
-            missing_m: 0.0,
-            displaced: false,
-        }
-    }
 }
 
 /// What one scan says of it.

@@ -1,14 +1,15 @@
 //! From the prior to the hypothesis that explains the scan best.
 
 use heapless::Vec;
-use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
+use nalgebra::{Isometry2, Matrix3};
 
 use super::heading_search::{self, MAX_PEAKS};
 use super::hypothesis::{Hypothesis, tight_score};
-use crate::config::{Checked, SlamConfig, not_negative};
+use super::search::SearchConfig;
+use crate::config::SlamConfig;
 use crate::frontend::extraction::MAX_SEGMENTS;
 use crate::geometry::math::min;
-use crate::geometry::pose::{components, difference, perpendicular, pose};
+use crate::geometry::pose::{components, diagonal, difference, pose};
 use crate::geometry::segment::Segment;
 use crate::map::MapSegment;
 use crate::map::nearby::Nearby;
@@ -19,107 +20,13 @@ use crate::tracking::correction::{
     Correction, CorrectionConfig, GaussNewtonConfig, Prior, Standpoint, Verdict, maximum_a_posteriori,
 };
 
-/// Settings of the search for a pose that explains more of a scan than the prediction does.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct SearchConfig {
-    /// The search is made where the prediction explains less than this share of the scan.
-    pub below_score: f32,
-    /// How far turns reach to each side, radians, whatever the wheels say.
-    pub reach_rad: f32,
-    /// What the prior of a hypothesis is widened by: standard deviations of position (m) and heading (rad), …
-    pub widen: [f32; 2],
-    /// … and of the position, for each metre that the wheels report: they may have slipped.
-    pub widen_per_m: f32,
-    /// Standard deviations of a proposed pose, by which its first pairs are gated: position (m) and heading (rad).
-    pub proposed: [f32; 2],
-    /// Share of the scan that must be explained more for another pose to be taken, …
-    pub gain: f32,
-    /// … and segments, where the prediction explains at least [`Self::something_score`], …
-    pub more_segments: f32,
-    /// … or less.
-    pub more_segments_from_nothing: f32,
-    /// See there.
-    pub something_score: f32,
-    /// What a hypothesis loses for each unit of squared Mahalanobis distance from the prediction, in the widened prior.
-    pub loss_per_chi2: f32,
-    /// A turn by more than this from the prediction, radians, …
-    pub far_rad: f32,
-    /// … must explain this share of the scan, …
-    pub far_score: f32,
-    /// … or this where the prediction explains less than [`Self::nothing_score`].
-    pub far_score_from_nothing: f32,
-    /// See there.
-    pub nothing_score: f32,
-    /// The prior is left out where its squared Mahalanobis distance from what the scan says is larger than this.
-    pub wild_chi2: f32,
-    /// Or where it was larger than this, …
-    pub suspicious_chi2: f32,
-    /// … in so many scans more than it was not: wheels that slip drag the pose along little by little.
-    pub suspicious_scans: u8,
-}
-
-impl SearchConfig {
-    /// Whether a hypothesis tells enough to be taken instead of the best known, so many radians from the prediction. One pair
-    /// fixes no pose, and a few short segments find something to lie on anywhere.
-    fn is_convincing(&self, hypothesis: &Hypothesis, best: &Hypothesis, turned_rad: f32) -> bool {
-        let more = if best.score > self.something_score {
-            self.more_segments
-        } else {
-            self.more_segments_from_nothing
-        };
-        let far = if best.score > self.nothing_score { self.far_score } else { self.far_score_from_nothing };
-        hypothesis.paired >= 2
-            && hypothesis.explained >= best.explained + more
-            && (turned_rad.abs() <= self.far_rad || hypothesis.score >= far)
-    }
-
-    /// What a hypothesis may be off by from the prediction after a motion: an error of the heading, made half before and half
-    /// after it, and one of the position.
-    fn widening(&self, moved: &Vector2<f32>) -> Matrix3<f32> {
-        let [position, heading] = self.widen;
-        let lever = perpendicular(*moved);
-        let (early, late) = (Vector3::new(lever.x, lever.y, 1.0), Vector3::new(0.0, 0.0, 1.0));
-        let by_way = self.widen_per_m * self.widen_per_m * moved.norm_squared();
-        variances([position, 0.0])
-            + Matrix3::from_diagonal(&Vector3::new(by_way, by_way, 0.0))
-            + (early * early.transpose() + late * late.transpose()) * (0.5 * heading * heading)
-    }
-
-    pub(crate) fn validate(&self) -> Checked {
-        let fields = [
-            ("correction.maximum_a_posteriori.search.below_score", self.below_score),
-            ("correction.maximum_a_posteriori.search.reach_rad", self.reach_rad),
-            ("correction.maximum_a_posteriori.search.widen", min(self.widen[0], self.widen[1])),
-            ("correction.maximum_a_posteriori.search.proposed", min(self.proposed[0], self.proposed[1])),
-            ("correction.maximum_a_posteriori.search.widen_per_m", self.widen_per_m),
-            ("correction.maximum_a_posteriori.search.more_segments", self.more_segments),
-            (
-                "correction.maximum_a_posteriori.search.more_segments_from_nothing",
-                self.more_segments_from_nothing,
-            ),
-            ("correction.maximum_a_posteriori.search.something_score", self.something_score),
-            ("correction.maximum_a_posteriori.search.gain", self.gain),
-            ("correction.maximum_a_posteriori.search.loss_per_chi2", self.loss_per_chi2),
-            ("correction.maximum_a_posteriori.search.far_rad", self.far_rad),
-            ("correction.maximum_a_posteriori.search.far_score", self.far_score),
-            ("correction.maximum_a_posteriori.search.far_score_from_nothing", self.far_score_from_nothing),
-            ("correction.maximum_a_posteriori.search.nothing_score", self.nothing_score),
-            ("correction.maximum_a_posteriori.search.wild_chi2", self.wild_chi2),
-            ("correction.maximum_a_posteriori.search.suspicious_chi2", self.suspicious_chi2),
-        ];
-        fields.into_iter().try_for_each(|(field, value)| not_negative(field, value))
-    }
-}
-
 /// Larger Mahalanobis distances from the prediction take no more off a hypothesis.
 const MOST_CHI2: f32 = 100.0;
 /// Where the scan overrules the prior, the estimate's covariance before it is made to explain the difference d, as adaptive
 /// filters do (Mehra, "Approaches to adaptive filtering", IEEE TAC 1972): by so many times d·dᵀ, and at least by these standard
 /// deviations, metres and radians.
 const LEFT_OUT_FACTOR: f32 = 2.0;
-const LEFT_OUT_FLOOR: [f32; 2] = [0.02, 0.02];
+const LEFT_OUT_FLOOR: [f32; 3] = [0.02, 0.02, 0.02];
 
 /// What is matched: a scan's segments in `base`, the map, and how.
 #[derive(Clone, Copy, Debug)]
@@ -186,13 +93,8 @@ impl<const N: usize> Tracker<N> {
         self.shortlist.clear();
     }
 
-    /// Share of those of the observed segments that count which the map explains from a pose that was just [refined](Self::refined).
-    pub fn score_of(
-        &self,
-        scene: &Scene<'_>,
-        pose: &Isometry2<f32>,
-        counts: impl Fn(&Segment) -> bool,
-    ) -> f32 {
+    /// Share of those of the observed segments that count, by their index, which the map explains from a pose that was just [refined](Self::refined).
+    pub fn score_of(&self, scene: &Scene<'_>, pose: &Isometry2<f32>, counts: impl Fn(usize) -> bool) -> f32 {
         tight_score(scene.observed, &self.pairs, scene.map, pose, &scene.config.line_noise, counts).0
     }
 
@@ -383,7 +285,7 @@ impl<const N: usize> Tracker<N> {
         watch: &mut impl FnMut(Stage),
         take: &mut dyn FnMut(Hypothesis),
     ) {
-        let centre = components(&broad.pose);
+        let (centre, [position, heading]) = (components(&broad.pose), config.proposed);
         let (observed, map) = (scene.observed, scene.map);
         let turns: Vec<f32, MAX_PEAKS> =
             heading_search::turns(observed, &broad.pose, map, &self.nearby, config.reach_rad);
@@ -391,7 +293,7 @@ impl<const N: usize> Tracker<N> {
             let turned = pose(centre.x, centre.y, centre.z + turn);
             let shift = heading_search::shift(observed, &turned, map, &self.nearby);
             let proposed = pose(centre.x + shift.x, centre.y + shift.y, centre.z + turn);
-            let start = Hypothesis::at(proposed, variances(config.proposed));
+            let start = Hypothesis::at(proposed, diagonal([position, position, heading]));
             take(self.refined(scene, broad, start, Kernel::Strict, watch));
         }
     }
@@ -417,14 +319,10 @@ fn step(
     }
 }
 
-fn variances([position, heading]: [f32; 2]) -> Matrix3<f32> {
-    Matrix3::from_diagonal(&Vector3::new(position * position, position * position, heading * heading))
-}
-
 /// By how much less sure a prior is to be taken that a scan overrules: covariance of (x, y, θ).
 fn left_out(by_scan: &Isometry2<f32>, prior: &Isometry2<f32>) -> Matrix3<f32> {
     let off = difference(by_scan, prior);
-    off * off.transpose() * LEFT_OUT_FACTOR + variances(LEFT_OUT_FLOOR)
+    off * off.transpose() * LEFT_OUT_FACTOR + diagonal(LEFT_OUT_FLOOR)
 }
 
 /// Squared Mahalanobis distance of the prediction from what the scan says. The correction that a Kalman update makes has the
