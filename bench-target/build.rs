@@ -62,7 +62,10 @@ fn constants(world: &Path, robot: &Path) -> Result<String, Box<dyn Error>> {
     }
     let begin = numbers(&set.begin);
     writeln!(text, "];\n/// Where the robot was a scan before.\nconst BEGIN: [f32; 3] = {begin:?};")?;
-    writeln!(text, "/// The map: nearest to the way first.\nstatic MAP: [MapSegment; {SEGMENTS}] = [")?;
+    writeln!(
+        text,
+        "/// The map, with the scans that saw each segment: nearest to the way first.\nstatic MAP: [(Segment, u16); {SEGMENTS}] = ["
+    )?;
     for entry in set.map(SEGMENTS) {
         writeln!(text, "{},", literal(&entry))?;
     }
@@ -75,13 +78,13 @@ fn numbers(at: &Isometry2<f32>) -> [f32; 3] {
 }
 
 fn literal(entry: &MapSegment) -> String {
-    let s = &entry.segment;
+    let s = &entry.segment();
     let m = &s.moments;
     let vector = |v: Vector2<f32>| format!("Vector2::new({:?}, {:?})", v.x, v.y);
     let point = |p: nalgebra::Point2<f32>| format!("Point2::new({:?}, {:?})", p.x, p.y);
     format!(
-        "MapSegment {{ segment: Segment {{ moments: Moments {{ inliers: {}, weight: {:?}, centroid: {}, scatter: {:?} }}, \
-         direction: {}, start: {}, end: {} }}, hits: {}, seen_through: 0, last_seen: 0, seen_at_m: 0.0 }}",
+        "(Segment {{ moments: Moments {{ inliers: {}, weight: {:?}, centroid: {}, scatter: {:?} }}, \
+         direction: {}, start: {}, end: {} }}, {})",
         m.inliers,
         m.weight,
         point(m.centroid),

@@ -10,6 +10,7 @@ use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Receiver;
 use embassy_time::{Duration, Instant, Ticker};
+use slam_core::Segment;
 use slam_core::geometry::pose::components;
 use slam_core::odometry::wheel_faults::WheelFault;
 use slam_core::tracking::TrackingState;
@@ -280,14 +281,14 @@ impl Mapping {
         let map = slam.map().segments();
         let next_few = map.iter().enumerate().skip(from).take(PRINT_AT_ONCE);
         for (_, entry) in next_few.filter(|(index, _)| slam.is_wall(*index)) {
-            let (a, b) = (entry.segment.start, entry.segment.end);
+            let Segment { start: a, end: b, moments, .. } = entry.segment();
             defmt::info!(
                 "segment {=f32} {=f32} {=f32} {=f32} points {=u32} scans {=u16}",
                 a.x,
                 a.y,
                 b.x,
                 b.y,
-                entry.segment.moments.inliers,
+                moments.inliers,
                 entry.hits
             );
         }

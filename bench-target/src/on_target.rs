@@ -87,7 +87,8 @@ fn run(name: &str, config: SlamConfig, known: usize, trouble: Trouble) {
         return;
     };
     let [x, y, heading] = BEGIN;
-    slam.take_up(&MAP[..known], pose(x, y, heading));
+    let entries = MAP[..known].iter().map(|(segment, hits)| MapSegment::new(segment, *hits, 0, 0.0));
+    slam.take_up(entries, pose(x, y, heading));
     defmt::println!("run {=str} {=usize}", name, known);
     for (k, (ranges_mm, motion)) in RANGES_MM.iter().zip(&MOTIONS).enumerate() {
         let mut motion = scan_motion(motion);

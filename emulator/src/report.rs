@@ -193,7 +193,7 @@ fn printed_map(outcome: &Outcome) -> anyhow::Result<Vec<MapSegment>> {
         // The variance says how sure the line is; nothing that is judged asks.
         let segment = Segment::from_ends(start, end, points.parse()?, 1.0, free);
         let hits = scans.parse()?;
-        map.push(MapSegment { segment, hits, seen_through: 0, last_seen: 0, seen_at_m: 0.0 });
+        map.push(MapSegment::new(&segment, hits, 0, 0.0));
     }
     Ok(map)
 }

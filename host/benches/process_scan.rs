@@ -48,7 +48,7 @@ fn run<const N: usize, const BEAMS: usize>(slam: &mut Slam<N, BEAMS>, set: &Fixe
 
 fn knowing<const N: usize, const BEAMS: usize>(set: &FixedSet, segments: usize) -> Box<Slam<N, BEAMS>> {
     let mut slam = Box::new(Slam::new(set.config).expect("the robot's configuration"));
-    slam.take_up(&set.map(segments), set.begin);
+    slam.take_up(set.map(segments).into_iter(), set.begin);
     slam
 }
 

@@ -18,7 +18,7 @@ fn main() -> anyhow::Result<()> {
         FixedSet::new(Path::new("worlds/office.toml"), &Robot::load(Path::new("robots/paper.toml"))?, SCANS)?;
     for _ in 0..times {
         let mut slam = Slam::<512>::new(set.config)?;
-        slam.take_up(&set.map(SEGMENTS), set.begin);
+        slam.take_up(set.map(SEGMENTS).into_iter(), set.begin);
         for (ranges_mm, motion) in set.ranges_mm.iter().zip(&set.motions) {
             std::hint::black_box(slam.process_scan(&Scan { ranges_mm }, motion));
         }

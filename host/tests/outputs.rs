@@ -12,7 +12,6 @@ use lineslam::output::{csv, dxf as drawing};
 use lineslam::replay;
 use lineslam::robot::Robot;
 use nalgebra::{Isometry2, Point2, Vector2};
-use slam_core::geometry::segment::Moments;
 use slam_core::{MapSegment, SlamConfig};
 
 fn simulate(out: &Path, more: &[&str]) -> Output {
@@ -134,21 +133,13 @@ fn nothing_is_written_when_the_recording_cannot_be() {
 
 #[test]
 fn segments_lie_in_the_drawing_by_how_often_they_were_seen() {
-    let along = |x: f32| slam_core::Segment {
-        start: Point2::new(x, 0.0),
-        end: Point2::new(x, 2.5),
-        direction: Vector2::y(),
-        moments: Moments::EMPTY,
+    let along = |x: f32| {
+        let ends = [Point2::new(x, 0.0), Point2::new(x, 2.5)];
+        slam_core::Segment::from_ends(ends[0], ends[1], 20, 1e-4, Point2::new(x - 1.0, 0.0))
     };
     let map: Vec<MapSegment> = [(0.0, 1), (1.0, 3), (2.0, 10)]
         .into_iter()
-        .map(|(x, hits)| MapSegment {
-            segment: along(x),
-            hits,
-            seen_through: 0,
-            last_seen: 0,
-            seen_at_m: 0.0,
-        })
+        .map(|(x, hits)| MapSegment::new(&along(x), hits, 0, 0.0))
         .collect();
     let bytes = drawing::render(&map, [Isometry2::identity()].iter()).unwrap();
     let read = dxf::Drawing::load(&mut Cursor::new(bytes)).unwrap();

@@ -15,7 +15,7 @@ struct Row {
 pub fn render(map: &[MapSegment]) -> Result<Vec<u8>, csv::Error> {
     let mut writer = csv::WriterBuilder::new().has_headers(false).from_writer(Vec::new());
     writer.write_record(["x1_m", "y1_m", "x2_m", "y2_m", "inliers"])?;
-    for MapSegment { segment, .. } in map {
+    for segment in map.iter().map(MapSegment::segment) {
         writer.serialize(Row {
             x1_m: segment.start.x,
             y1_m: segment.start.y,

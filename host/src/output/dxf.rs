@@ -47,7 +47,7 @@ pub fn render<'a>(
     (header.creation_date, header.creation_date_universal) = Default::default();
     (header.update_date, header.update_date_universal) = Default::default();
     (header.fingerprint_guid, header.version_guid) = Default::default();
-    let ends = map.iter().flat_map(|entry| [entry.segment.start, entry.segment.end]);
+    let ends = map.iter().flat_map(|entry| [entry.segment().start, entry.segment().end]);
     let (low, high) = bounds(ends.chain(path.iter().copied()));
     header.minimum_drawing_extents = point(low);
     header.maximum_drawing_extents = point(high);
@@ -55,9 +55,10 @@ pub fn render<'a>(
         let (name, color) = (name.to_owned(), Color::from_index(colour));
         drawing.add_layer(Layer { name, color, ..Layer::default() });
     }
-    for MapSegment { segment, hits, .. } in map {
+    for entry in map {
+        let segment = entry.segment();
         let line = Line::new(point(segment.start), point(segment.end));
-        add(&mut drawing, layer(*hits), EntityType::Line(line));
+        add(&mut drawing, layer(entry.hits), EntityType::Line(line));
     }
     if path.len() > 1 {
         let vertex =

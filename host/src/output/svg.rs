@@ -102,7 +102,7 @@ impl View {
                 .map
                 .iter()
                 .filter(|s| s.hits >= ESTABLISHED_HITS)
-                .flat_map(|s| [s.segment.start, s.segment.end]),
+                .flat_map(|s| [s.segment().start, s.segment().end]),
         );
         points.extend(scene.blueprint.iter().flat_map(|e| [e.from, e.to]).map(|p| p.map(|v| v as f32)));
         points.extend(picture.path.iter().map(|pose| Point2::from(pose.translation.vector)));
@@ -220,9 +220,9 @@ fn scan_points(points: &[Point2<f32>], view: &View) -> Path {
 fn walls(map: &[MapSegment], view: &View) -> Group {
     let (mut once, mut often) = (String::new(), String::new());
     for entry in map {
-        let ((x1, y1), (x2, y2)) = (view.px(entry.segment.start), view.px(entry.segment.end));
+        let ((x1, y1), (x2, y2)) = (view.px(entry.segment().start), view.px(entry.segment().end));
         let d = if entry.hits >= ESTABLISHED_HITS { &mut often } else { &mut once };
-        if view.holds(entry.segment.midpoint()) {
+        if view.holds(entry.segment().midpoint()) {
             let _ = write!(d, "M{x1} {y1}L{x2} {y2}");
         }
     }

@@ -42,7 +42,7 @@ impl FixedSet {
         let logged = driven.log.scans.get(from..from + scans).context("the drive has fewer scans")?;
         let before = from.checked_sub(1).and_then(|k| replayed.steps.get(k)).context("no scan before")?;
         let from_way = |entry: &MapSegment| {
-            let middle = entry.segment.midpoint().coords;
+            let middle = entry.segment().midpoint().coords;
             let apart = steps.iter().map(|s| (middle - s.pose_in_final_map.translation.vector).norm());
             apart.fold(f32::MAX, f32::min)
         };
@@ -61,9 +61,7 @@ impl FixedSet {
     pub fn map(&self, segments: usize) -> Vec<MapSegment> {
         let copies = (0..).flat_map(|copy| {
             let beside = pose(0.0, copy as f32 * APART_M, 0.0);
-            self.own
-                .iter()
-                .map(move |entry| MapSegment { segment: entry.segment.transformed(&beside), ..*entry })
+            self.own.iter().map(move |entry| entry.with_segment(&entry.segment().transformed(&beside)))
         });
         if self.own.is_empty() { Vec::new() } else { copies.take(segments).collect() }
     }

@@ -137,8 +137,8 @@ pub fn judge(world: &World, drive: &Drive, replay: &Replay) -> Judgement {
         corners.lay(&map, starts.into_iter().flatten(), with_scale)
     };
     let (edges, discs) = (world.edges(), world.discs());
-    let established: Vec<&Segment> =
-        map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(|s| &s.segment).collect();
+    let established: Vec<Segment> =
+        map.iter().filter(|s| s.hits >= ESTABLISHED_HITS).map(MapSegment::segment).collect();
     let covered = off.iter().zip(&covariances).filter(|(off, p)| off.along_m.powi(2) <= 4.0 * p.m11);
     Judgement {
         corner_error_m: corners::mean_error_m(&found),
@@ -168,9 +168,7 @@ pub fn corner_errors(world: &World, drive: &Drive, map: &[MapSegment]) -> Vec<f6
 pub fn map_in_world(drive: &Drive, map: &[MapSegment]) -> Vec<MapSegment> {
     let world_from_map: Isometry2<f32> =
         drive.truth.first().map_or_else(Isometry2::identity, |t| nalgebra::convert_unchecked(*t));
-    map.iter()
-        .map(|entry| MapSegment { segment: entry.segment.transformed(&world_from_map), ..*entry })
-        .collect()
+    map.iter().map(|entry| entry.with_segment(&entry.segment().transformed(&world_from_map))).collect()
 }
 
 /// The straight surfaces of the blueprint in the map's frame.

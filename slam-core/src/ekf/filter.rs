@@ -22,7 +22,7 @@ use crate::geometry::line_observation::by_pose;
 use crate::geometry::math::{VARIANCE_FLOOR, max, sin_cos, within};
 use crate::geometry::pose::{components, pose};
 use crate::geometry::segment::Segment;
-use crate::map::SegmentMap;
+use crate::map::{END_STEP_M, SegmentMap};
 use crate::odometry::bias::OdometryBias;
 
 /// Largest variances of the pose's position (m²) and heading (rad²). Beyond them `f32` does not resolve the lines around the robot
@@ -186,14 +186,14 @@ impl EkfSlam {
         for slot in 0..LINES {
             let Some(entry) = self.slots.line_id(slot).and_then(|index| map.get_mut(index)) else { continue };
             let [offset, direction] = line_states(slot);
-            let mut line = entry.segment.shifted(error(offset), error(direction));
+            let mut line = entry.segment().shifted(error(offset), error(direction));
             self.reset_normal(slot, error(direction), &line, &injected);
             self.move_centroid(slot, &mut line);
             let [var_offset, var_direction] =
                 [offset, direction].map(|state| self.variance_given_pose(state, pose_information.as_ref()));
             line = with_variances(&line, var_offset, var_direction);
             if line.is_finite() {
-                entry.segment = line;
+                entry.set_segment(&line);
             }
         }
         injected
@@ -220,7 +220,9 @@ impl EkfSlam {
         if var_direction > 0.0 {
             let way = -self.covariance.get(offset, direction) / var_direction;
             let (a, b) = (line.along_of(line.start), line.along_of(line.end));
-            let way = if a <= b { within(way, a, b) } else { 0.0 };
+            // Whole steps, so that the ends stay where they are.
+            let way =
+                if a <= b { END_STEP_M * ((within(way, a, b) / END_STEP_M) as i32) as f32 } else { 0.0 };
             if way * way * var_direction > MIN_CENTROID_GAIN * self.covariance.get(offset, offset) {
                 self.covariance.add_multiples(offset, &[(direction, way)]);
                 line.moments.centroid += line.direction * way;

@@ -201,16 +201,15 @@ impl KeyframeUpdate {
         max_gap_m: f32,
     ) {
         mark_seen(entry, stamp);
-        let moments = &mut entry.segment.moments;
-        moments.inliers = moments.inliers.saturating_add(segment.moments.inliers);
+        entry.add_inliers(segment);
         let ends = [segment.start, segment.end];
         let ends_in_map = ends.map(|end| at.pose * end);
-        if entry.segment.gap_to_m(ends_in_map) > max_gap_m {
+        if entry.segment().gap_to_m(ends_in_map) > max_gap_m {
             return;
         }
-        let extended = entry.segment.extended(ends_in_map);
-        if extended.length_m() > entry.segment.length_m() && self.extensions.push((slot, ends)).is_err() {
-            entry.segment = extended;
+        let extended = entry.segment().extended(ends_in_map);
+        if extended.length_m() > entry.length_m() && self.extensions.push((slot, ends)).is_err() {
+            entry.set_segment(&extended);
         }
     }
 
@@ -244,9 +243,9 @@ impl KeyframeUpdate {
         let mut committed = filter.commit(&prior, map);
         for &(slot, ends) in &self.extensions {
             if let Some(entry) = filter.line_id(slot).and_then(|index| map.get_mut(index)) {
-                let extended = entry.segment.extended(ends.map(|end| committed * end));
+                let extended = entry.segment().extended(ends.map(|end| committed * end));
                 if extended.is_finite() {
-                    entry.segment = extended;
+                    entry.set_segment(&extended);
                 }
             }
         }
@@ -256,9 +255,9 @@ impl KeyframeUpdate {
             let Some(entry) = map.get_mut(index).filter(|e| e.last_seen == scan && e.hits == 1) else {
                 continue;
             };
-            let segment = entry.segment.transformed(&moved);
+            let segment = entry.segment().transformed(&moved);
             if segment.is_finite() {
-                entry.segment = segment;
+                entry.set_segment(&segment);
                 filter.augment(index, committed.translation.vector, map);
             }
         }
@@ -315,7 +314,7 @@ fn add_unknown<const N: usize>(
         // One with a pair may stand apart from it, behind an opening of the same wall.
         let pair = seen.pairs.iter().find(|pair| pair.observed == index);
         let ends = [segment.start, segment.end].map(|end| at.pose * end);
-        let goes_on = |line: &MapSegment| line.segment.gap_to_m(ends) <= config.merge_gap_m;
+        let goes_on = |line: &MapSegment| line.segment().gap_to_m(ends) <= config.merge_gap_m;
         if pair.is_some_and(|pair| map.segments().get(pair.mapped).is_some_and(goes_on)) {
             continue;
         }
@@ -339,7 +338,7 @@ impl Pair {
         map: &SegmentMap<N>,
     ) -> Option<Measurement> {
         let segment = seen.segments.get(self.observed)?;
-        let mapped = &map.segments().get(self.mapped)?.segment;
+        let mapped = &map.segments().get(self.mapped)?.segment();
         let noise = ObservationNoise::new(segment, mapped, &seen.sensor.line_noise);
         let position = at.prior.translation.vector.into();
         let seen = LineObservation::new(&segment.transformed(&at.pose), mapped, position, noise);

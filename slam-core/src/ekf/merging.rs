@@ -41,8 +41,7 @@ pub(super) fn merge_walls<const N: usize>(
                         Relation::of(&changed, s, &position, &sensor.line_noise, config) == Some(relation)
                     })
             };
-            let mut along =
-                near.along(changed.segment.direction, config.merge_max_angle_rad).map(usize::from);
+            let mut along = near.along(changed.direction(), config.merge_max_angle_rad).map(usize::from);
             along.find(is_related)
         };
         if changed.last_seen != scan {
@@ -60,7 +59,7 @@ pub(super) fn merge_walls<const N: usize>(
             next += 1;
             continue;
         };
-        let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment.moments.inliers);
+        let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment().moments.inliers);
         let (kept, gone) = if inliers(twin) > inliers(index) { (twin, index) } else { (index, twin) };
         if let Some(updated) = update_by_twins([kept, gone], sensor, config, pose, filter, map) {
             *pose = updated;
@@ -83,7 +82,7 @@ fn update_by_twins<const N: usize>(
     map: &mut SegmentMap<N>,
 ) -> Option<Isometry2<f32>> {
     let [kept, gone] = twins.map(|index| filter.activate(index, config.reactivation_inflation, map));
-    let [a, b] = twins.map(|index| map.segments().get(index).map(|s| s.segment));
+    let [a, b] = twins.map(|index| map.segments().get(index).map(MapSegment::segment));
     let (a, b) = (a?, b?);
     let noise = sensor.line_noise.added_to([0.0, 0.0], min(a.length_m(), b.length_m()));
     let measurement = Measurement::of_twins((&a, kept?), (&b, gone?), noise);
@@ -109,7 +108,7 @@ impl Relation {
         noise: &LineNoise,
         config: &EkfConfig,
     ) -> Option<Self> {
-        let (a, b) = (&a.segment, &b.segment);
+        let (a, b) = (&a.segment(), &b.segment());
         let facing = a.direction.dot(&b.direction) > 0.0;
         if !facing || cross(a.direction, b.direction).abs() > config.merge_max_angle_rad {
             return None;

@@ -13,7 +13,7 @@ use crate::ekf::measurement::Jacobian;
 use crate::ekf::state::{FIRST_LINE, LINES, STATES, line_states};
 use crate::geometry::line_noise::{variances, with_variances};
 use crate::geometry::line_observation::by_pose;
-use crate::map::SegmentMap;
+use crate::map::{MapSegment, SegmentMap};
 
 /// A line of the map: its index there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -123,7 +123,7 @@ impl EkfSlam {
             self.slots.in_use |= 1 << slot;
             return Some(slot);
         }
-        let segment = map.segments().get(index)?.segment;
+        let segment = map.segments().get(index)?.segment();
         let slot = self.take_slot(map)?;
         self.assign(slot, index, f32::INFINITY);
         for (state, variance) in line_states(slot).into_iter().zip(variances(&segment)) {
@@ -140,7 +140,7 @@ impl EkfSlam {
         position: Vector2<f32>,
         map: &mut SegmentMap<N>,
     ) {
-        let Some(segment) = map.segments().get(index).map(|s| s.segment) else { return };
+        let Some(segment) = map.segments().get(index).map(MapSegment::segment) else { return };
         let [var_offset, var_direction] = variances(&segment);
         let by_pose = by_pose(segment.normal(), segment.moments.centroid.coords - position);
         let jacobian = Jacobian::by_pose(by_pose);
@@ -151,7 +151,7 @@ impl EkfSlam {
         let (var_offset, var_direction) = (o_o + var_offset, d_d + var_direction);
         let Some(slot) = slot else {
             if let Some(entry) = map.get_mut(index) {
-                entry.segment = with_variances(&segment, var_offset, var_direction);
+                entry.set_segment(&with_variances(&segment, var_offset, var_direction));
             }
             return;
         };
@@ -185,7 +185,7 @@ impl EkfSlam {
         let Some(copy) = self.take_slot(map) else {
             if let Some(entry) = map.get_mut(index) {
                 let [var_offset, var_direction] = states.map(|state| self.covariance.get(state, state));
-                entry.segment = with_variances(&entry.segment, var_offset, var_direction);
+                entry.set_segment(&with_variances(&entry.segment(), var_offset, var_direction));
             }
             return;
         };
@@ -229,7 +229,7 @@ impl EkfSlam {
         let [offset, direction] = line_states(slot);
         if let Some(entry) = self.line_id(slot).and_then(|index| map.get_mut(index)) {
             let [var_offset, var_direction] = [offset, direction].map(|i| self.covariance.get(i, i));
-            entry.segment = with_variances(&entry.segment, var_offset, var_direction);
+            entry.set_segment(&with_variances(&entry.segment(), var_offset, var_direction));
         }
         self.drop_slot(slot);
     }

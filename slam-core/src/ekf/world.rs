@@ -124,7 +124,7 @@ impl World {
             let entry = self.map.get_mut(index).unwrap();
             entry.last_seen = self.scan;
             let position = self.believed.translation.vector;
-            let measurement = measurement(slot, &entry.segment, &seen, position, SEEN);
+            let measurement = measurement(slot, &entry.segment(), &seen, position, SEEN);
             self.filter.update(&measurement, &PLAIN, UpdateScope::All);
         }
         self.believed = self.filter.commit(&self.believed, &mut self.map);

@@ -110,19 +110,19 @@ fn a_motion_that_is_no_number_leaves_the_robot_unsure_where_it_was() {
 fn pose_and_lines_move_at_once_and_only_once() {
     let mut robot = Robot::new(SlamConfig::default());
     assert_eq!(robot.see(&[wall()]).new, 1);
-    let at_first = robot.map.segments()[0].segment;
+    let at_first = robot.map.segments()[0].segment();
     // Two decimetres by the odometry, and a centimetre more by the wall.
     assert!(robot.go(0.1, 0.0, 0.0) && robot.go(0.1, 0.0, 0.0));
     robot.tracker.pairs.push(crate::tracking::association::Pair { observed: 0, mapped: 0 }).unwrap();
     let seen = wall().transformed(&pose(-0.21, 0.0, 0.0));
     assert_eq!(robot.see(&[seen]).matched, 1);
-    assert_eq!(robot.map.segments()[0].segment.midpoint(), at_first.midpoint(), "not yet");
+    assert_eq!(robot.map.segments()[0].segment().midpoint(), at_first.midpoint(), "not yet");
     let before = robot.estimator.pose();
     let (estimator, mut around) = robot.with(&[]);
     estimator.commit(&mut around);
     let after = robot.estimator.pose();
     let gone_on = (before.inverse() * after).translation.vector.x;
-    let pushed = (robot.map.segments()[0].segment.midpoint() - at_first.midpoint()).x;
+    let pushed = (robot.map.segments()[0].segment().midpoint() - at_first.midpoint()).x;
     assert!(gone_on > 0.0 && pushed < 0.0, "both give way: {gone_on} {pushed}");
     let (estimator, mut around) = robot.with(&[]);
     estimator.commit(&mut around);
@@ -139,14 +139,14 @@ fn what_is_local_moves_as_one_and_old_lines_stay_with_their_places() {
     estimator.commit(&mut around);
     let seen = |robot: &Robot| {
         let base_from_map = robot.estimator.pose().inverse();
-        base_from_map * robot.map.segments()[1].segment.midpoint()
+        base_from_map * robot.map.segments()[1].segment().midpoint()
     };
-    let (old, new) = (robot.map.segments()[0].segment, seen(&robot));
+    let (old, new) = (robot.map.segments()[0].segment(), seen(&robot));
     let before = (robot.estimator.pose(), robot.estimator.local().covariance.determinant());
     let moved = pose(0.5, -0.3, 0.2);
     let (estimator, mut around) = robot.with(&[]);
     estimator.carry(&moved, &Places::<96>::new(), &mut around);
-    assert_eq!(robot.map.segments()[0].segment.midpoint(), old.midpoint(), "no place has moved");
+    assert_eq!(robot.map.segments()[0].segment().midpoint(), old.midpoint(), "no place has moved");
     assert!((seen(&robot) - new).norm() < 1e-5);
     assert!(
         (robot.estimator.pose().translation.vector - (moved * before.0).translation.vector).norm() < 1e-5

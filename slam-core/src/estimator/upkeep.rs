@@ -31,10 +31,11 @@ impl Estimator {
             let Some(entry) = around.map.get_mut(index) else { continue };
             let is_local =
                 self.travelled_m - entry.seen_at_m <= config.local_m && entry.seen_at_m >= self.jumped_at_m;
-            let by = if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.segment.midpoint()) };
-            let segment = entry.segment.transformed(&by);
+            let by =
+                if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.segment().midpoint()) };
+            let segment = entry.segment().transformed(&by);
             if segment.is_finite() {
-                entry.segment = segment;
+                entry.set_segment(&segment);
             }
             if let Some(filter) = self.filter.as_mut().filter(|_| !is_local) {
                 filter.decouple_line(index, around.map);
@@ -114,7 +115,7 @@ impl Estimator {
             let Some(entry) = map.segments().get(index).filter(|e| e.hits >= config.min_hits) else {
                 continue;
             };
-            let segment = entry.segment;
+            let segment = entry.segment();
             let view = view.filter(|_| config.looks_at(rank, nearby.len(), first));
             let Some(opening) = opening(&segment, way, view, config) else { continue };
             let parts = opening.cut(&segment);

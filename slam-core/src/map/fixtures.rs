@@ -11,5 +11,5 @@ pub fn line(from: (f32, f32), to: (f32, f32), hits: u16) -> MapSegment {
     let (from, to) = (Point2::new(from.0, from.1), Point2::new(to.0, to.1));
     let free = nalgebra::center(&from, &to) + perpendicular(to - from);
     let segment = Segment::from_ends(from, to, 9, 1e-4, free);
-    MapSegment { segment, hits, seen_through: 0, last_seen: 1, seen_at_m: 0.0 }
+    MapSegment::new(&segment, hits, 1, 0.0)
 }

@@ -5,6 +5,7 @@
 
 #[cfg(test)]
 pub(crate) mod fixtures;
+mod map_segment;
 pub mod nearby;
 pub mod openings;
 pub mod store;
@@ -15,35 +16,10 @@ use heapless::Vec;
 
 use crate::geometry::math::max;
 use crate::geometry::segment::Segment;
+pub(crate) use map_segment::END_STEP_M;
+pub use map_segment::MapSegment;
 
-/// A segment of the map, 64 bytes.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct MapSegment {
-    /// The segment in `map`. Its weight and scatter say how sure its line is; while it is tracked with the pose, how sure it
-    /// would be if the pose were known.
-    pub segment: Segment,
-    /// Number of scans that saw it, with the filter of keyframes; stays at its maximum.
-    pub hits: u16,
-    /// Scans whose beams went through it since it was last seen.
-    pub seen_through: u16,
-    /// Number of the last scan that saw it.
-    pub last_seen: u32,
-    /// Way the robot had driven by then, metres.
-    pub seen_at_m: f32,
-}
-
-/// After this way unseen a segment is worth half, metres.
-const HALF_WORTH_M: f32 = 5.0;
-
-impl MapSegment {
-    /// What it is worth keeping, to a robot that has driven so far.
-    fn worth(&self, way_m: f32) -> f32 {
-        f32::from(self.hits) / (1.0 + max(way_m - self.seen_at_m, 0.0) / HALF_WORTH_M)
-    }
-}
-
-/// Up to `N` segments; 64·`N` bytes and a few words. `N` may be up to 65 535.
+/// Up to `N` segments; 40·`N` bytes and a few words. `N` may be up to 65 535.
 #[derive(Clone, Debug, Default)]
 pub struct SegmentMap<const N: usize> {
     segments: Vec<MapSegment, N>,
@@ -95,9 +71,9 @@ impl<const N: usize> SegmentMap<N> {
     /// Begins anew with these segments, which have not been seen yet by any scan to come.
     pub(crate) fn take_up(&mut self, segments: impl Iterator<Item = MapSegment>) {
         self.segments.clear();
-        for entry in segments {
-            if !entry.segment.is_finite() || self.segments.push(MapSegment { last_seen: 0, ..entry }).is_err()
-            {
+        for mut entry in segments {
+            entry.last_seen = 0;
+            if !entry.segment().is_finite() || self.segments.push(entry).is_err() {
                 self.counters.refused = self.counters.refused.saturating_add(1);
             }
         }
@@ -110,8 +86,7 @@ impl<const N: usize> SegmentMap<N> {
     /// Adds a segment seen by scan `seen`, after a way of `seen_at_m`. Returns its index, if it
     /// found a place. Work: `N` steps when full.
     pub fn insert(&mut self, segment: Segment, seen: u32, seen_at_m: f32) -> Option<usize> {
-        let entry = MapSegment { segment, hits: 1, seen_through: 0, last_seen: seen, seen_at_m };
-        self.insert_entry(entry, seen, None)
+        self.insert_entry(MapSegment::new(&segment, 1, seen, seen_at_m), seen, None)
     }
 
     /// The same for one that may have been seen before; `now` is the scan at hand, and `spared` does not give way to it.
@@ -142,9 +117,8 @@ impl<const N: usize> SegmentMap<N> {
         let taken = self.segments.swap_remove(gone);
         let index = if kept == self.segments.len() { gone } else { kept };
         let Some(kept) = self.segments.get_mut(index) else { return };
-        kept.segment = kept.segment.extended([taken.segment.start, taken.segment.end]);
-        kept.segment.moments.inliers =
-            kept.segment.moments.inliers.saturating_add(taken.segment.moments.inliers);
+        kept.set_segment(&kept.segment().extended([taken.segment().start, taken.segment().end]));
+        kept.add_inliers(&taken.segment());
         kept.hits = kept.hits.max(taken.hits);
         kept.last_seen = kept.last_seen.max(taken.last_seen);
         kept.seen_at_m = max(kept.seen_at_m, taken.seen_at_m);
@@ -165,16 +139,16 @@ impl<const N: usize> SegmentMap<N> {
                 return None;
             }
         };
-        entry.segment = kept;
+        entry.set_segment(&kept);
         self.counters.opened = self.counters.opened.saturating_add(1);
-        let part = MapSegment { segment: other?, ..*entry };
+        let part = entry.with_segment(&other?);
         self.insert_entry(part, now, Some(index))
     }
 
     /// Forgets the segments that are not finite.
     pub(crate) fn forget_broken(&mut self) {
         for index in (0..self.segments.len()).rev() {
-            if self.segments.get(index).is_some_and(|entry| !entry.segment.is_finite()) {
+            if self.segments.get(index).is_some_and(|entry| !entry.segment().is_finite()) {
                 self.forget(index);
             }
         }
@@ -200,9 +174,9 @@ mod tests {
 
     #[test]
     fn size_is_what_the_documentation_says() {
-        assert_eq!(core::mem::size_of::<MapSegment>(), 64);
+        assert_eq!(core::mem::size_of::<MapSegment>(), 40);
         let bytes = SegmentMap::<512>::BYTES;
-        assert!(bytes <= 512 * 64 + 64, "{bytes}");
+        assert!(bytes <= 512 * 40 + 64, "{bytes}");
     }
 
     #[test]
@@ -213,7 +187,7 @@ mod tests {
         }
         map.get_mut(0).unwrap().hits = 9;
         assert_eq!(map.insert(segment(4.0), 6, 0.0), Some(1));
-        let kept: std::vec::Vec<f32> = map.segments().iter().map(|s| s.segment.start.x).collect();
+        let kept: std::vec::Vec<f32> = map.segments().iter().map(|s| s.segment().start.x).collect();
         assert_eq!(kept, [1.0, 4.0, 3.0]);
         assert_eq!(map.counters().evicted, 1);
     }
@@ -237,7 +211,7 @@ mod tests {
         map.insert(segment(1.01), 3, 0.0);
         map.fuse(0, 2);
         assert_eq!(map.segments().len(), 2);
-        assert_eq!(map.segments()[0].segment.moments.inliers, 20);
+        assert_eq!(map.segments()[0].segment().moments.inliers, 20);
         assert_eq!(map.segments()[0].last_seen, 3);
         map.fuse(0, 0);
         map.fuse(0, 9);
@@ -251,12 +225,11 @@ mod tests {
         for entry in [wall(0.0, 5.0, 3), wall(9.0, 5.0, 50)] {
             assert!(map.insert_entry(entry, 1, None).is_some());
         }
-        let parts = [wall(0.0, 3.0, 1), wall(0.0, 1.0, 1)].map(|part| Some(part.segment));
+        let parts = [wall(0.0, 3.0, 1), wall(0.0, 1.0, 1)].map(|part| Some(part.segment()));
         assert_eq!(map.cut(0, parts, 7), Some(1));
-        assert_eq!(
-            map.segments().iter().map(|s| s.segment.length_m()).collect::<std::vec::Vec<_>>(),
-            [3.0, 1.0]
-        );
+        for (entry, length_m) in map.segments().iter().zip([3.0, 1.0]) {
+            assert!((entry.length_m() - length_m).abs() < 1e-5);
+        }
         assert_eq!(map.segments()[1].hits, 3, "a part is as old as the whole");
     }
 }

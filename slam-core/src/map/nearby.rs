@@ -45,15 +45,15 @@ impl<const N: usize> Nearby<N> {
         counts: impl Fn(&MapSegment) -> bool,
     ) {
         let near = |entry: &MapSegment| {
-            let to_middle = entry.segment.midpoint().coords - pose.translation.vector;
-            let radius = reach_m + 0.5 * entry.segment.length_m();
+            let to_middle = entry.segment().midpoint().coords - pose.translation.vector;
+            let radius = reach_m + 0.5 * entry.length_m();
             to_middle.norm_squared() <= radius * radius && counts(entry)
         };
         // A counting sort: the sector of each and how many there are of it, where each sector begins, then each to its place.
         let mut sectors = [NO_SECTOR; N];
         self.ends = [0; SECTORS];
         for (own, entry) in sectors.iter_mut().zip(map).filter(|(_, entry)| near(entry)) {
-            let sector = sector(entry.segment.direction);
+            let sector = sector(entry.direction());
             if let Some(count) = self.ends.get_mut(sector) {
                 *own = sector as u8;
                 *count += 1;
@@ -127,7 +127,7 @@ mod tests {
         let end = start + Vector2::new(c, s);
         // Seen from its left, so that it runs from start to end.
         let segment = Segment::from_ends(start, end, 10, 1e-4, start + Vector2::new(-s, c));
-        MapSegment { segment, hits: 1, seen_through: 0, last_seen: 0, seen_at_m: 0.0 }
+        MapSegment::new(&segment, 1, 0, 0.0)
     }
 
     proptest! {
@@ -139,10 +139,10 @@ mod tests {
         ) {
             let map: std::vec::Vec<MapSegment> = places.iter().map(|&(x, y, a)| entry(x, y, a)).collect();
             let mut nearby = Nearby::<64>::new();
-            nearby.gather(&map, &pose(1.0, 0.0, 2.0), 5.6, |s| s.segment.midpoint().x > -8.0);
+            nearby.gather(&map, &pose(1.0, 0.0, 2.0), 5.6, |s| s.segment().midpoint().x > -8.0);
             let plain: BTreeSet<u16> = (0..map.len() as u16)
                 .filter(|i| {
-                    let s = &map[usize::from(*i)].segment;
+                    let s = &map[usize::from(*i)].segment();
                     let near = (s.midpoint() - Point2::new(1.0, 0.0)).norm() <= 5.6 + 0.5 * s.length_m();
                     near && s.midpoint().x > -8.0
                 })
@@ -155,7 +155,7 @@ mod tests {
             prop_assert_eq!(once.len(), found.len());
             prop_assert!(once.is_subset(&plain));
             for index in plain {
-                let own = map[usize::from(index)].segment.direction;
+                let own = map[usize::from(index)].direction();
                 let apart = libm::acosf(own.dot(&direction).clamp(-1.0, 1.0));
                 prop_assert!(apart > within - 1e-3 || once.contains(&index), "{} rad apart", apart);
             }
@@ -177,11 +177,7 @@ mod tests {
         // One near, one far, one far but long.
         let long =
             Segment::from_ends(Point2::new(-50.0, 1.0), Point2::new(50.0, 1.0), 9, 1e-4, Point2::origin());
-        let map = [
-            entry(1.0, 0.0, 0.0),
-            entry(9.0, 0.0, 0.0),
-            MapSegment { segment: long, ..entry(0.0, 0.0, 0.0) },
-        ];
+        let map = [entry(1.0, 0.0, 0.0), entry(9.0, 0.0, 0.0), entry(0.0, 0.0, 0.0).with_segment(&long)];
         let mut nearby = Nearby::<4>::new();
         nearby.gather(&map, &Isometry2::identity(), 5.6, |_| true);
         assert_eq!(nearby.all().iter().copied().collect::<BTreeSet<_>>(), BTreeSet::from([0, 2]));

@@ -47,17 +47,17 @@ pub struct StoredLine {
 impl StoredLine {
     /// Of a line of the map.
     pub fn of(entry: &MapSegment) -> Self {
-        let MapSegment { segment, hits, seen_at_m, .. } = entry;
+        let segment = entry.segment();
         let Segment { moments, start, end, .. } = segment;
         Self {
             start_m: [start.x, start.y],
             end_m: [end.x, end.y],
-            middle_m: -segment.along_of(*start),
+            middle_m: -segment.along_of(start),
             sigma_offset_m: sqrt(1.0 / moments.weight),
             sigma_direction_rad: sqrt(1.0 / moments.scatter_along(segment.direction)),
             points: moments.inliers,
-            hits: *hits,
-            seen_at_m: *seen_at_m,
+            hits: entry.hits,
+            seen_at_m: entry.seen_at_m,
         }
     }
 
@@ -86,9 +86,7 @@ impl StoredLine {
             ],
         };
         let segment = Segment { moments, direction, start, end };
-        let entry =
-            MapSegment { segment, hits: self.hits, seen_through: 0, last_seen: 0, seen_at_m: self.seen_at_m };
-        segment.is_finite().then_some(entry)
+        segment.is_finite().then(|| MapSegment::new(&segment, self.hits, 0, self.seen_at_m))
     }
 }
 
@@ -269,25 +267,25 @@ mod tests {
 
     #[test]
     fn a_line_comes_back_as_it_was() {
-        let entry = MapSegment { seen_at_m: 3.5, ..line((1.0, -2.0), (3.0, 1.5), 7) };
+        let entry = line((1.0, -2.0), (3.0, 1.5), 7).seen_at(3.5);
         let back = StoredLine::of(&entry).entry().unwrap();
         let off = |a: Point2<f32>, b: Point2<f32>| (a - b).norm();
-        assert!(off(back.segment.start, entry.segment.start) < 1e-5);
-        assert!(off(back.segment.moments.centroid, entry.segment.moments.centroid) < 1e-5);
-        assert!((back.segment.direction - entry.segment.direction).norm() < 1e-6);
+        assert!(off(back.segment().start, entry.segment().start) < 1e-5);
+        assert!(off(back.segment().moments.centroid, entry.segment().moments.centroid) < 1e-5);
+        assert!((back.direction() - entry.direction()).norm() < 1e-6);
         assert_eq!((back.hits, back.seen_at_m, back.last_seen), (7, 3.5, 0));
-        let along = |entry: &MapSegment| entry.segment.moments.scatter_along(entry.segment.direction);
+        let along = |entry: &MapSegment| entry.segment().moments.scatter_along(entry.direction());
         assert!((along(&back) / along(&entry) - 1.0).abs() < 1e-4);
-        assert!((back.segment.moments.weight / entry.segment.moments.weight - 1.0).abs() < 1e-5);
+        assert!((back.segment().moments.weight / entry.segment().moments.weight - 1.0).abs() < 1e-5);
     }
 
     #[test]
     fn so_does_what_an_opening_left_of_a_line() {
-        let mut entry = line((0.0, 1.0), (5.0, 1.0), 7);
-        entry.segment.start.x = 4.8;
+        let whole = line((0.0, 1.0), (5.0, 1.0), 7);
+        let entry = whole.with_segment(&Segment { start: Point2::new(4.8, 1.0), ..whole.segment() });
         let back = StoredLine::of(&entry).entry().unwrap();
-        assert!((back.segment.moments.centroid - entry.segment.moments.centroid).norm() < 1e-5);
-        assert!((back.segment.length_m() - 0.2).abs() < 1e-5);
+        assert!((back.segment().moments.centroid - entry.segment().moments.centroid).norm() < 1e-5);
+        assert!((back.length_m() - 0.2).abs() < 1e-5);
     }
 
     #[test]

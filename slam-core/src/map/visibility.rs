@@ -121,7 +121,7 @@ pub(crate) fn mark_seen_through<const N: usize>(
         let Some(entry) = map.get_mut(usize::from(candidate)) else { continue };
         if entry.last_seen == scan_number {
             entry.seen_through = 0;
-        } else if view.sees_through(&entry.segment) {
+        } else if view.sees_through(&entry.segment()) {
             entry.seen_through = entry.seen_through.saturating_add(1);
         }
     }
@@ -139,8 +139,8 @@ pub(crate) fn confirmed_and_contradicted(
     for entry in candidates.iter().filter_map(|candidate| map.get(usize::from(*candidate))) {
         let counted = match () {
             () if entry.hits < view.config.scans => continue,
-            () if view.sees_through(&entry.segment) => 1,
-            () if view.measures(&entry.segment) => 0,
+            () if view.sees_through(&entry.segment()) => 1,
+            () if view.measures(&entry.segment()) => 0,
             () => continue,
         };
         if let Some(count) = counts.get_mut(counted) {

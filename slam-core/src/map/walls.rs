@@ -62,14 +62,14 @@ impl WallConfig {
     }
 
     fn is_bridge(&self, index: usize, entry: &MapSegment, map: &[MapSegment]) -> bool {
-        let segment = &entry.segment;
+        let segment = &entry.segment();
         let [least, most] = self.sines;
         let bears = |(other_index, other): &(usize, &MapSegment)| {
-            let sine = cross(other.segment.direction, segment.direction).abs();
+            let sine = cross(other.direction(), segment.direction).abs();
             *other_index != index
                 && other.hits > entry.hits
                 && (least..=most).contains(&sine)
-                && [segment.start, segment.end].iter().any(|end| self.lies_on(*end, &other.segment))
+                && [segment.start, segment.end].iter().any(|end| self.lies_on(*end, &other.segment()))
         };
         segment.length_m() <= self.max_bridge_m && map.iter().enumerate().any(|other| bears(&other))
     }
@@ -93,7 +93,7 @@ impl WallConfig {
         let is_twin = |(other_index, other): &(usize, &MapSegment)| {
             (entry.seen_at_m - other.seen_at_m).abs() > self.revisit_m
                 && self.is_out_of_sight(other, way_m)
-                && self.lie_side_by_side(&entry.segment, &other.segment)
+                && self.lie_side_by_side(&entry.segment(), &other.segment())
                 && self.is_wall(*other_index, map)
         };
         map.iter().enumerate().find(is_twin).map_or(Fate::Stays, |(twin, _)| Fate::IsOneWith(twin))
@@ -131,7 +131,7 @@ mod tests {
     }
 
     fn entry(from: (f32, f32), to: (f32, f32), hits: u16) -> MapSegment {
-        MapSegment { seen_at_m: 3.0, ..line(from, to, hits) }
+        line(from, to, hits).seen_at(3.0)
     }
 
     /// A wall with a recess of 12 cm, its side, and what is seen of it at a slant.
@@ -173,7 +173,7 @@ mod tests {
     #[test]
     fn a_wall_of_two_visits_is_one_when_both_are_out_of_sight() {
         let first = entry((0.0, 0.0), (3.0, 0.0), 9);
-        let later = |from, to| MapSegment { seen_at_m: 50.0, ..entry(from, to, 9) };
+        let later = |from, to| entry(from, to, 9).seen_at(50.0);
         let of = |other: MapSegment, way_m| config().fate(0, &[first, other], way_m);
         let again = later((1.0, 0.08), (4.0, 0.08));
         assert_eq!(of(again, 70.0), Fate::IsOneWith(1));
@@ -181,6 +181,6 @@ mod tests {
         assert_eq!(of(later((1.0, 0.3), (4.0, 0.3)), 70.0), Fate::Stays, "too far apart");
         assert_eq!(of(later((4.0, 0.08), (1.0, 0.08)), 70.0), Fate::Stays, "the wall's other side");
         assert_eq!(of(later((2.5, 0.08), (5.0, 0.08)), 70.0), Fate::Stays, "the wall goes on");
-        assert_eq!(of(MapSegment { seen_at_m: 5.0, ..again }, 70.0), Fate::Stays, "seen on the same visit");
+        assert_eq!(of(again.seen_at(5.0), 70.0), Fate::Stays, "seen on the same visit");
     }
 }

@@ -54,12 +54,12 @@ pub fn register_end_points<const N: usize>(
             continue;
         };
         // Eq. (10), then Fig. 6.
-        let joined = joined_by_end_points(&entry.segment, &segment.transformed(pose), config.weight);
+        let joined = joined_by_end_points(&entry.segment(), &segment.transformed(pose), config.weight);
         if !joined.is_finite() {
             report.doubtful += 1;
             continue;
         }
-        entry.segment = joined;
+        entry.set_segment(&joined);
         mark_seen(entry, &seen.stamp);
         report.matched += 1;
     }

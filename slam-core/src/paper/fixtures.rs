@@ -30,10 +30,7 @@ pub fn room() -> Vec<Segment> {
 
 /// As the map holds them.
 pub fn entries(walls: &[Segment]) -> Vec<MapSegment> {
-    walls
-        .iter()
-        .map(|&segment| MapSegment { segment, hits: 5, seen_through: 0, last_seen: 1, seen_at_m: 0.0 })
-        .collect()
+    walls.iter().map(|segment| MapSegment::new(segment, 5, 1, 0.0)).collect()
 }
 
 /// Each with the one of its number.

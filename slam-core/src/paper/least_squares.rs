@@ -93,7 +93,7 @@ fn normal_equations(
     for pair in pairs {
         let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get(pair.mapped)) else { continue };
         let seen = seen.transformed(&predicted.pose);
-        let line = entry.segment.line();
+        let line = entry.segment().line();
         let (u, n) = (line.normal, seen.moments.inliers as f32);
         for p in [seen.start, seen.end] {
             let turned = perpendicular(p.coords - centre).dot(&u); // M(p − c)·u
@@ -166,7 +166,7 @@ mod tests {
         let residuals = |d: [f64; 3]| {
             let mut all = Vec::new();
             for (seen, entry) in observed.iter().zip(map) {
-                let line = entry.segment.line();
+                let line = entry.segment().line();
                 let (ux, uy, b) =
                     (f64::from(line.normal.x), f64::from(line.normal.y), f64::from(line.distance_m));
                 for end in [seen.start, seen.end] {

@@ -109,26 +109,32 @@ const AROUND: usize = 48;
 
 /// The longest lines of the map of which a point lies within `reach_m` of a pose, in its frame, sorted by direction. Work: a pass over the map.
 pub(super) fn around(map: &[MapSegment], at: &Isometry2<f32>, reach_m: f32) -> Vec<Ray, AROUND> {
-    let known = map.iter().filter(|entry| entry.hits >= LEAST_HITS).map(|entry| &entry.segment);
-    let longest = longest::<AROUND>(known.filter(|segment| is_within(segment, at, reach_m)));
+    let is_known = |entry: &&MapSegment| entry.hits >= LEAST_HITS && is_within(&entry.segment(), at, reach_m);
+    let longest = longest::<_, AROUND>(map.iter().filter(is_known), |entry| entry.length_m());
     let place_from_map = at.inverse();
-    let in_place = |segment: &&Segment| ray(place_from_map * segment.start, place_from_map * segment.end);
+    let in_place = |entry: &&MapSegment| {
+        let segment = entry.segment();
+        ray(place_from_map * segment.start, place_from_map * segment.end)
+    };
     let mut rays: Vec<Ray, AROUND> = longest.iter().filter_map(in_place).collect();
     sort_few(&mut rays, |ray| ray.angle_rad);
     rays
 }
 
-/// The longest of some segments, in any order.
-fn longest<'a, const N: usize>(segments: impl Iterator<Item = &'a Segment>) -> Vec<&'a Segment, N> {
-    let mut longest: Vec<&Segment, N> = Vec::new();
+/// The longest of some items, in any order.
+fn longest<T: Copy, const N: usize>(
+    items: impl Iterator<Item = T>,
+    length_m: impl Fn(&T) -> f32,
+) -> Vec<T, N> {
+    let mut longest: Vec<T, N> = Vec::new();
     let mut least_m = LEAST_SEEN_M;
-    for segment in segments {
-        if segment.length_m() < least_m {
+    for item in items {
+        if length_m(&item) < least_m {
             continue;
         }
-        keep_most(&mut longest, segment, |segment| segment.length_m());
+        keep_most(&mut longest, item, &length_m);
         if longest.is_full() {
-            least_m = longest.iter().map(|s| s.length_m()).fold(f32::INFINITY, min);
+            least_m = longest.iter().map(&length_m).fold(f32::INFINITY, min);
         }
     }
     longest
@@ -136,8 +142,10 @@ fn longest<'a, const N: usize>(segments: impl Iterator<Item = &'a Segment>) -> V
 
 /// The longest of a scan's segments, in `base`, longest first.
 pub(crate) fn of_scan(observed: &[Segment]) -> Vec<Ray, PLACE_LINES> {
-    let mut rays: Vec<Ray, PLACE_LINES> =
-        longest::<PLACE_LINES>(observed.iter()).iter().filter_map(|s| ray(s.start, s.end)).collect();
+    let mut rays: Vec<Ray, PLACE_LINES> = longest::<&Segment, PLACE_LINES>(observed.iter(), |s| s.length_m())
+        .iter()
+        .filter_map(|s| ray(s.start, s.end))
+        .collect();
     sort_few(&mut rays, |ray| -ray.length_m);
     rays
 }
@@ -161,27 +169,25 @@ pub(super) fn chosen(
         if !counts(entry) || !is_of(entry, anchor) {
             continue;
         }
-        let worth = min(entry.segment.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS));
+        let worth = min(entry.length_m(), MOST_LENGTH_M) * f32::from(entry.hits.min(MOST_HITS));
         keep_most(&mut candidates, (index as u16, worth), |candidate| candidate.1);
     }
     let place_from_map = anchor.inverse();
-    let mut taken: Vec<&Segment, PLACE_LINES> = Vec::new();
+    let mut taken: Vec<Vector2<f32>, PLACE_LINES> = Vec::new();
     let mut lines = PlaceLines::new();
     while !taken.is_full() {
-        let alike = |segment: &Segment| {
-            let same =
-                taken.iter().filter(|other| cross(other.direction, segment.direction).abs() < ALIKE_SINE);
-            same.count() as f32
+        let alike = |direction: Vector2<f32>| {
+            taken.iter().filter(|other| cross(**other, direction).abs() < ALIKE_SINE).count() as f32
         };
         let worth = |(index, worth): &(u16, f32)| {
-            map.get(usize::from(*index)).map_or(0.0, |entry| worth / (1.0 + alike(&entry.segment)))
+            map.get(usize::from(*index)).map_or(0.0, |entry| worth / (1.0 + alike(entry.direction())))
         };
         let valued = candidates.iter().enumerate().map(|(rank, candidate)| (rank, worth(candidate)));
         let Some((rank, _)) = valued.min_by(|a, b| b.1.total_cmp(&a.1)) else { break };
         let index = usize::from(candidates.remove(rank).0);
         let Some(entry) = map.get(index).filter(|_| is_wall(index)) else { continue };
-        let _ = taken.push(&entry.segment);
-        let ends = clipped(&entry.segment.transformed(&place_from_map));
+        let _ = taken.push(entry.direction());
+        let ends = clipped(&entry.segment().transformed(&place_from_map));
         if let Some(line) = ends.and_then(|[start, end]| PlaceLine::of(start, end)) {
             let _ = lines.push(line);
         }
@@ -192,8 +198,8 @@ pub(super) fn chosen(
 /// Whether a line may be one of a place.
 fn is_of(entry: &MapSegment, anchor: &Isometry2<f32>) -> bool {
     entry.hits >= LEAST_HITS
-        && entry.segment.length_m() >= LEAST_LENGTH_M
-        && is_within(&entry.segment, anchor, REACH_M)
+        && entry.length_m() >= LEAST_LENGTH_M
+        && is_within(&entry.segment(), anchor, REACH_M)
 }
 
 /// Whether a point of a segment lies within `reach_m` of a pose.
@@ -241,8 +247,8 @@ mod tests {
         let map = [line((101.0, -49.0), (99.0, -46.5), 5)];
         let lines = chosen(&map, &anchor, |_| true, |_| true);
         let [start, end] = lines[0].ends();
-        assert!((anchor * start - map[0].segment.start).norm() < 1e-3);
-        assert!((anchor * end - map[0].segment.end).norm() < 1e-3);
+        assert!((anchor * start - map[0].segment().start).norm() < 1e-3);
+        assert!((anchor * end - map[0].segment().end).norm() < 1e-3);
     }
 
     #[test]

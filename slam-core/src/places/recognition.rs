@@ -125,14 +125,15 @@ mod tests {
         assert_eq!(lines.len(), map.len());
         assert!(lines.is_sorted_by(|a, b| a.angle_rad <= b.angle_rad));
         for here in [pose(2.0, 2.5, 0.3), pose(4.0, 1.0, -2.5), pose(1.5, 3.0, 1.2), pose(5.0, 2.0, 3.1)] {
-            let seen: std::vec::Vec<_> = map.iter().map(|e| e.segment.transformed(&here.inverse())).collect();
+            let seen: std::vec::Vec<_> =
+                map.iter().map(|e| e.segment().transformed(&here.inverse())).collect();
             let proposed = anywhere(&of_scan(&seen), &lines);
             let truth = there.inv_mul(&here);
             let off = |at: &Isometry2<f32>| components(&truth.inv_mul(at)).norm();
             assert!(proposed.iter().any(|at| off(at) < 0.01), "{here} {proposed:?}");
         }
         assert!(anywhere(&[], &lines).is_empty());
-        let short = of_scan(&[map[4].segment.transformed(&there.inverse())]);
+        let short = of_scan(&[map[4].segment().transformed(&there.inverse())]);
         assert!(!anywhere(&short, &lines).is_empty() && anywhere(&short, &[]).is_empty());
     }
 }

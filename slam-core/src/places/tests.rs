@@ -23,7 +23,7 @@ fn building(w: f32, h: f32) -> std::vec::Vec<Segment> {
         let from = at * Point2::new(random(), side);
         let (s, c) = (core::f32::consts::TAU * random()).sin_cos();
         let length = 0.5 + 1.5 * random();
-        walls.push(line((from.x, from.y), (from.x + c * length, from.y + s * length), 9).segment);
+        walls.push(line((from.x, from.y), (from.x + c * length, from.y + s * length), 9).segment());
     }
     walls
 }
@@ -67,13 +67,7 @@ impl Drive {
         // The local map: what is around, as the robot believes it to lie.
         let map_from_truth = self.estimate * to.inverse();
         let near = |s: &&Segment| (s.midpoint().coords - to.translation.vector).norm() < 6.0;
-        let entry = |s: &Segment| MapSegment {
-            segment: s.transformed(&map_from_truth),
-            hits: 9,
-            seen_through: 0,
-            last_seen: 1,
-            seen_at_m: self.way_m,
-        };
+        let entry = |s: &Segment| MapSegment::new(&s.transformed(&map_from_truth), 9, 1, self.way_m);
         let map: std::vec::Vec<_> = building.iter().filter(near).map(entry).collect();
         let (pose, way_m) = (self.estimate, self.way_m);
         self.path.push((way_m, pose, to));

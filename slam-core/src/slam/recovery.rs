@@ -21,8 +21,8 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
 
     /// Takes up a map made before, with the robot at a pose in it that is taken as certain. Segments beyond the capacity are left out, and
     /// counted as refused.
-    pub fn take_up(&mut self, map: &[MapSegment], map_from_base: Isometry2<f32>) {
-        self.map.take_up(map.iter().map(|entry| MapSegment { seen_at_m: 0.0, ..*entry }));
+    pub fn take_up(&mut self, map: impl Iterator<Item = MapSegment>, map_from_base: Isometry2<f32>) {
+        self.map.take_up(map.map(|entry| entry.seen_at(0.0)));
         self.places.clear();
         self.jump(&Prior { pose: map_from_base, covariance: Matrix3::zeros() });
     }

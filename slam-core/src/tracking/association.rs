@@ -128,7 +128,7 @@ impl Shortlist {
             };
             for mapped in nearby.along(direction, wide.max_angle_rad) {
                 let Some(entry) = map.get(usize::from(mapped)) else { continue };
-                if may_be(&direction, &centroid, &entry.segment, &wide)
+                if may_be(&direction, &centroid, &entry.segment(), &wide)
                     && self.pairs.push((index as u8, mapped)).is_err()
                 {
                     return;
@@ -196,7 +196,7 @@ fn pair_with_best(
 ) {
     let mut best: Option<(f32, usize)> = None;
     for mapped in candidates.map(usize::from) {
-        if let Some(score) = map.get(mapped).and_then(|entry| score(&entry.segment))
+        if let Some(score) = map.get(mapped).and_then(|entry| score(&entry.segment()))
             && best.is_none_or(|(least, _)| score < least)
         {
             best = Some((score, mapped));
@@ -251,10 +251,8 @@ mod tests {
     }
 
     fn pair(observed: &Segment, map: &[Segment], config: &AssociationConfig, sigma_m: f32) -> Option<usize> {
-        let map: std::vec::Vec<MapSegment> = map
-            .iter()
-            .map(|&segment| MapSegment { segment, hits: 3, seen_through: 0, last_seen: 0, seen_at_m: 0.0 })
-            .collect();
+        let map: std::vec::Vec<MapSegment> =
+            map.iter().map(|segment| MapSegment::new(segment, 3, 0, 0.0)).collect();
         let mut nearby = Nearby::<4>::new();
         nearby.gather(&map, &Isometry2::identity(), f32::INFINITY, |_| true);
         let covariance =
@@ -331,7 +329,7 @@ mod tests {
             steps in proptest::collection::vec((-0.2f32..0.2, -0.2f32..0.2, -0.08f32..0.08), 1..6),
         ) {
             let walls: std::vec::Vec<Segment> = walls.iter().map(|&(x, y, dx, dy)| wall((x, y), (x + dx, y + dy))).collect();
-            let entry = |&segment: &Segment| MapSegment { segment, hits: 3, seen_through: 0, last_seen: 0, seen_at_m: 0.0 };
+            let entry = |segment: &Segment| MapSegment::new(segment, 3, 0, 0.0);
             let map: std::vec::Vec<MapSegment> = walls.iter().map(entry).collect();
             let mut nearby = Nearby::<64>::new();
             nearby.gather(&map, &Isometry2::identity(), 40.0, |_| true);

@@ -177,7 +177,7 @@ fn pair_sums(
     for pair in pairs {
         let (Some(seen), Some(entry)) = (observed.get(pair.observed), map.get(pair.mapped)) else { continue };
         let seen = seen.transformed(from.pose);
-        let Some(residual) = Residual::new(&seen, &entry.segment, position, line_noise) else { continue };
+        let Some(residual) = Residual::new(&seen, &entry.segment(), position, line_noise) else { continue };
         let Some(weight) = residual.information() else { continue };
         let chi2 = match from.forgiven {
             Some(covariance) => residual.chi2(covariance),

@@ -60,7 +60,7 @@ pub fn turns<const N: usize>(
         let mut own = [0.0f32; MAX_BINS];
         for mapped in nearby.along(direction, reach_rad) {
             let Some(entry) = map.get(usize::from(mapped)) else { continue };
-            let to = entry.segment.direction;
+            let to = entry.direction();
             let turn = atan2(cross(direction, to), direction.dot(&to));
             if turn.abs() > reach_rad {
                 continue;
@@ -121,7 +121,7 @@ pub fn shift<const N: usize>(
         let in_map = seen.transformed(from);
         for mapped in nearby.along(in_map.direction, PARALLEL_SINE) {
             let Some(entry) = map.get(usize::from(mapped)) else { continue };
-            vote(&in_map, &entry.segment, &mut own);
+            vote(&in_map, &entry.segment(), &mut own);
         }
         let weight = min(seen.moments.inliers as f32, MOST_POINTS[1]);
         for (sum, vote) in votes.iter_mut().flatten().zip(own.iter().flatten()) {
@@ -216,7 +216,7 @@ mod tests {
             let truth = pose(0.3, 0.2, 0.4);
             let map: std::vec::Vec<MapSegment> = room()
                 .into_iter()
-                .map(|segment| MapSegment { segment, hits: 5, seen_through: 0, last_seen: 1, seen_at_m: 0.0 })
+                .map(|segment| MapSegment::new(&segment, 5, 1, 0.0))
                 .collect();
             let observed: std::vec::Vec<Segment> =
                 room().iter().map(|s| s.transformed(&truth.inverse())).collect();

@@ -268,7 +268,7 @@ fn segments(replay: &Replay, ns: u64) -> MarkerArray<'static> {
     let markers = [(sure, SURE), (tentative, TENTATIVE)].into_iter().zip(0..);
     // RViz complains about lines without points.
     let markers = markers.filter(|((entries, _), _)| !entries.is_empty()).map(|((entries, colour), id)| {
-        let points = entries.iter().flat_map(|e| [e.segment.start, e.segment.end]).map(corner);
+        let points = entries.iter().flat_map(|e| [e.segment().start, e.segment().end]).map(corner);
         Marker::lines(header(ns, MAP), id, SEGMENT_WIDTH_M, colour, points.collect())
     });
     MarkerArray { markers: markers.collect() }

@@ -137,7 +137,7 @@ fn carried(map: &[MapSegment], by: &Similarity2<f64>) -> Vec<MapSegment> {
         carried.direction = nalgebra::convert_unchecked(by.isometry.rotation * direction);
         carried
     };
-    map.iter().map(|entry| MapSegment { segment: carry(&entry.segment), ..*entry }).collect()
+    map.iter().map(|entry| entry.with_segment(&carry(&entry.segment()))).collect()
 }
 
 impl Corner {
@@ -187,7 +187,7 @@ fn line_for(
     map: &[MapSegment],
 ) -> Option<(Vector2<f64>, f64)> {
     let fits = |entry: &&MapSegment| {
-        let segment = &entry.segment;
+        let segment = &entry.segment();
         let direction: Vector2<f64> = nalgebra::convert(segment.direction);
         let ends: [Point2<f64>; 2] = [segment.start, segment.end].map(nalgebra::convert);
         let ways = ends.map(|end| (end - corner).dot(wall));
@@ -198,8 +198,8 @@ fn line_for(
             && ways[0].min(ways[1]) < WALL_REACH_M
             && ways[0].max(ways[1]) > 0.1
     };
-    let best = map.iter().filter(fits).max_by_key(|entry| entry.segment.moments.inliers)?;
-    let line = best.segment.line();
+    let best = map.iter().filter(fits).max_by_key(|entry| entry.segment().moments.inliers)?;
+    let line = best.segment().line();
     Some((nalgebra::convert(line.normal), f64::from(line.distance_m)))
 }
 
@@ -213,13 +213,13 @@ mod tests {
         let inside = Point2::new(3.0f32, 2.0);
         let wall = |from: [f32; 2], to: [f32; 2]| {
             let segment = Segment::from_ends(from.into(), to.into(), 100, 1e-4, inside);
-            MapSegment { segment, hits: 9, seen_through: 0, last_seen: 1, seen_at_m: 0.0 }
+            MapSegment::new(&segment, 9, 1, 0.0)
         };
         let map: Vec<MapSegment> = (0..4).map(|k| wall(corners[k], corners[(k + 1) % 4])).collect();
         let corner = |k: usize| {
             let at: Point2<f64> = nalgebra::convert(Point2::from(corners[k]));
             let walls = [(k + 3) % 4, k].map(|wall| {
-                let segment = &map[wall].segment;
+                let segment = &map[wall].segment();
                 let middle: Point2<f64> = nalgebra::convert(segment.midpoint());
                 [(middle - at).normalize(), nalgebra::convert(segment.normal())]
             });

@@ -56,7 +56,7 @@ fn variances_that_rounding_spoilt_are_survived() {
         }
         let pose = world.filter.commit(&world.believed, &mut world.map);
         assert!(crate::geometry::pose::is_finite(&pose));
-        assert!(world.map.segments().iter().all(|s| s.segment.is_finite()), "{spoilt}");
+        assert!(world.map.segments().iter().all(|s| s.segment().is_finite()), "{spoilt}");
     }
 }
 

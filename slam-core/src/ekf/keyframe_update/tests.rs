@@ -58,8 +58,8 @@ fn unmatched_segments_are_added_and_matched_ones_joined() {
     let check = |map: &SegmentMap<8>, reports: [RegistrationReport; 2]| {
         assert_eq!(reports.map(|r| (r.new, r.matched)), [(1, 0), (1, 1)]);
         let joined = &map.segments()[0];
-        assert_eq!((joined.hits, joined.segment.moments.inliers), (2, 80));
-        assert!((joined.segment.length_m() - 3.0).abs() < 1e-4, "ends are the farthest feet");
+        assert_eq!((joined.hits, joined.segment().moments.inliers), (2, 80));
+        assert!((joined.length_m() - 3.0).abs() < 1e-4, "ends are the farthest feet");
     };
     let (mut map, here) = (SegmentMap::new(), pose(0.0, 0.0, 0.0));
     let config = EndPointsConfig { weight: EndPointWeight::Equal };
@@ -81,7 +81,7 @@ fn one_wall_seen_in_pieces_becomes_one_segment() {
     // A look at the middle closes the first gap, not the second.
     let pairs = [Pair { observed: 0, mapped: 0 }];
     run(&mut map, &mut filter, &[wall((0.5, 1.0), (3.0, 1.0))], &pairs, 2);
-    let mut lengths: StdVec<f32> = map.segments().iter().map(|s| s.segment.length_m()).collect();
+    let mut lengths: StdVec<f32> = map.segments().iter().map(|s| s.length_m()).collect();
     lengths.sort_by(f32::total_cmp);
     assert_eq!(lengths.len(), 2);
     assert!((lengths[1] - 3.5).abs() < 1e-3);
@@ -147,8 +147,8 @@ fn measurements_taken_in_one_by_one_are_those_taken_in_at_once() {
     // But for rounding.
     assert!((components(&slowly.commit()) - components(&at_once.commit())).amax() < 1e-6);
     for (a, b) in slowly.map.segments().iter().zip(at_once.map.segments()) {
-        assert!((a.segment.start - b.segment.start).norm() < 1e-6);
-        assert!((a.segment.end - b.segment.end).norm() < 1e-6);
+        assert!((a.segment().start - b.segment().start).norm() < 1e-6);
+        assert!((a.segment().end - b.segment().end).norm() < 1e-6);
     }
     let covariance = slowly.filter.pose_covariance();
     assert!((covariance - at_once.filter.pose_covariance()).amax() < 1e-4 * covariance.amax());
@@ -162,7 +162,7 @@ fn what_is_new_lies_as_it_was_seen() {
         let mut keyframe = Keyframe::new(0.03, tracked);
         let committed = keyframe.commit();
         assert!((committed.translation.vector.x - 0.03).abs() < 2e-3, "{tracked}: {committed}");
-        let new = keyframe.map.segments()[4].segment.transformed(&committed.inverse());
+        let new = keyframe.map.segments()[4].segment().transformed(&committed.inverse());
         assert!((new.midpoint().x - 1.97).abs() < 1e-3, "{tracked}: {new:?}");
     }
 }
@@ -194,7 +194,7 @@ fn apart_m(length_m: f32, keyframes: u32) -> f32 {
         run(&mut map, &mut filter, &walls, &pairs, scan);
     }
     assert_eq!(map.segments().len(), 2, "the door stays open");
-    let [first, second] = [0, 1].map(|i| map.segments()[i].segment);
+    let [first, second] = [0, 1].map(|i| map.segments()[i].segment());
     first.line().signed_distance(second.midpoint()).abs()
 }
 
@@ -225,11 +225,11 @@ fn walls_that_differ_stay_apart() {
 fn a_pair_that_does_not_fit_changes_nothing() {
     let (mut map, mut filter) = (SegmentMap::<8>::new(), filter());
     run(&mut map, &mut filter, &[wall((0.0, 1.0), (2.0, 1.0))], &[], 1);
-    let before = map.segments()[0].segment;
+    let before = map.segments()[0].segment();
     let pairs = [Pair { observed: 0, mapped: 0 }];
     let report = run(&mut map, &mut filter, &[wall((0.0, 1.3), (2.0, 1.3))], &pairs, 2);
     assert_eq!((report.doubtful, report.new), (1, 0));
-    let after = map.segments()[0].segment;
+    let after = map.segments()[0].segment();
     assert_eq!((after.start, after.end, after.direction), (before.start, before.end, before.direction));
     assert_eq!(map.segments()[0].hits, 1);
 }
@@ -260,18 +260,18 @@ fn a_tracked_line_evicted_between_keyframe_and_commit_gives_its_error_to_nobody(
     let (full, filter_full, new, pose_full) = five_walls_and_two::<6>();
     let (roomy, filter_roomy, _, pose_roomy) = five_walls_and_two::<8>();
     assert_eq!((full.counters().evicted, roomy.counters().evicted), (1, 0));
-    let fifth = roomy.segments()[4].segment.midpoint().x;
+    let fifth = roomy.segments()[4].segment().midpoint().x;
     assert!((fifth + 1.0).abs() < 3e-3, "it had an error of three centimetres: {fifth}");
     assert!((components(&pose_full) - components(&pose_roomy)).amax() < 1e-6);
     let covariance = filter_roomy.pose_covariance();
     assert!((filter_full.pose_covariance() - covariance).amax() < 1e-4 * covariance.amax());
     for index in 0..4 {
-        let (a, b) = (&full.segments()[index].segment, &roomy.segments()[index].segment);
+        let (a, b) = (&full.segments()[index].segment(), &roomy.segments()[index].segment());
         assert!((a.start - b.start).norm() < 1e-5 && (a.end - b.end).norm() < 1e-5, "{index}");
     }
     for seen in new {
         let lies = full.segments()[4..].iter().any(|entry| {
-            let in_base = entry.segment.transformed(&pose_full.inverse());
+            let in_base = entry.segment().transformed(&pose_full.inverse());
             (in_base.midpoint() - seen.midpoint()).norm() < 1e-3
         });
         assert!(lies, "where it was seen: {seen:?}");

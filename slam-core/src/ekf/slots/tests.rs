@@ -9,7 +9,7 @@ fn a_line_activated_again_has_inflated_variances_and_no_correlations() {
     let index = 3;
     let slot = world.filter.slot_of(index).unwrap();
     world.filter.decouple(slot, &mut world.map);
-    let own = variances(&world.map.segments()[index].segment);
+    let own = variances(&world.map.segments()[index].segment());
     let slot = world.filter.activate(index, INFLATION, &mut world.map).unwrap();
     for (state, own) in line_states(slot).into_iter().zip(own) {
         assert_eq!(world.filter.covariance.get(state, state), INFLATION * own);

@@ -94,7 +94,7 @@ fn world_and_measurements(noise: [f32; 2]) -> (World, Vec<(usize, Measurement)>)
     let mut measurements = Vec::new();
     for index in 0..world.map.segments().len() {
         let Some(slot) = world.filter.slot_of(index) else { continue };
-        let mapped = world.map.segments()[index].segment;
+        let mapped = world.map.segments()[index].segment();
         let seen = mapped.shifted(0.01 * world.gauss.draw(), 0.02 * world.gauss.draw());
         measurements.push((slot, measurement(slot, &mapped, &seen, position, noise)));
     }
@@ -178,7 +178,7 @@ fn a_constraint_between_lines_is_that_of_a_dense_filter() {
     let line = |k: usize| {
         let slot = measurements[k].0;
         let index = world.filter.line_id(slot).unwrap();
-        (world.map.segments()[index].segment, slot)
+        (world.map.segments()[index].segment(), slot)
     };
     let ((a, slot_a), (b, slot_b)) = (line(0), line(3));
     let mut constraint = Measurement::of_twins((&a, slot_a), (&b, slot_b), SEEN);
@@ -219,8 +219,8 @@ fn augmentation_is_that_of_a_dense_filter() {
     let position = world.believed.translation.vector;
     let (a, b) = (position + Vector2::new(1.0, 0.8), position + Vector2::new(1.4, -0.3));
     let new = Segment::from_ends(a.into(), b.into(), 20, 1e-4, position.into());
-    let [var_offset, var_direction] = variances(&new);
     let index = world.map.insert(new, world.scan, 0.0).unwrap();
+    let [var_offset, var_direction] = variances(&world.map.segments()[index].segment());
     world.filter.augment(index, position, &mut world.map);
     let slot = world.filter.slot_of(index).unwrap();
     let [offset, direction] = line_states(slot);

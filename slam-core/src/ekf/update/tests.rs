@@ -12,14 +12,14 @@ fn in_the_scope_of_a_line_only_that_line_changes() {
     let before = world.filter.clone();
     let entry = world.map.segments()[0];
     let slot = world.filter.activate(0, INFLATION, &mut world.map).unwrap();
-    let seen = entry.segment.shifted(0.05, 0.1);
+    let seen = entry.segment().shifted(0.05, 0.1);
     let position = world.believed.translation.vector;
-    let measurement = measurement(slot, &entry.segment, &seen, position, SEEN);
+    let measurement = measurement(slot, &entry.segment(), &seen, position, SEEN);
     world.filter.update(&measurement, &PLAIN, UpdateScope::Line(slot));
     assert_eq!(world.filter.pose_covariance(), before.pose_covariance());
     let same = world.filter.commit(&world.believed, &mut world.map);
     assert_eq!(components(&same), components(&world.believed));
-    let moved = world.map.segments()[0].segment.midpoint() - entry.segment.midpoint();
+    let moved = world.map.segments()[0].segment().midpoint() - entry.segment().midpoint();
     assert!(moved.norm() > 0.01, "{moved}");
 }
 
@@ -32,8 +32,8 @@ fn the_test_uses_the_same_covariance_as_the_update() {
     for index in 0..world.map.segments().len() {
         let entry = world.map.segments()[index];
         let Some(slot) = world.filter.slot_of(index) else { continue };
-        let seen = entry.segment.shifted(0.02, 0.01);
-        let measurement = measurement(slot, &entry.segment, &seen, position, SEEN);
+        let seen = entry.segment().shifted(0.02, 0.01);
+        let measurement = measurement(slot, &entry.segment(), &seen, position, SEEN);
         let test = world.filter.test(&measurement);
         let mut with = [[0.0; STATES]; 2];
         world.filter.covariance_times(&measurement.jacobian, &mut with);
@@ -66,7 +66,7 @@ fn deferred_downdates_are_those_made_at_once() {
     let tracked = (0..world.map.segments().len()).filter_map(|i| Some((i, world.filter.slot_of(i)?)));
     let measurements: std::vec::Vec<_> = tracked
         .map(|(index, slot)| {
-            let segment = world.map.segments()[index].segment;
+            let segment = world.map.segments()[index].segment();
             let seen = segment.shifted(0.01 * world.gauss.draw(), 0.02 * world.gauss.draw());
             let scope = match index % 5 {
                 2 => UpdateScope::RobotAndLine(slot),
