@@ -12,15 +12,20 @@ use core::sync::atomic::{Ordering, compiler_fence};
 use fletcher::calc_fletcher64;
 use slam_core::ConfigError;
 
+use crate::lidar::BEAMS;
 use crate::robot;
 
-/// Map segments there is room for.
-pub const SEGMENTS: usize = 512;
+/// Map segments and places there is room for: a whole floor …
+#[cfg(not(feature = "small"))]
+pub const ROOM: [usize; 2] = [1024, 256];
+/// … or less, on parts with 128 KiB of RAM.
+#[cfg(feature = "small")]
+pub const ROOM: [usize; 2] = [512, 96];
 /// Odometry samples there is room for: 0.32 s.
 pub const SAMPLES: usize = 64;
 
 /// The map, the pose and the odometry.
-pub type Mapper = slam_core::Mapper<SEGMENTS, SAMPLES>;
+pub type Mapper = slam_core::Mapper<{ ROOM[0] }, SAMPLES, BEAMS, { ROOM[1] }>;
 
 const WORD: usize = size_of::<u32>();
 const MAGIC: u32 = 0x4C53_4C4D;

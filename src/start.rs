@@ -4,10 +4,9 @@ use defmt_rtt as _;
 use embassy_executor::Spawner;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Channel;
-use slam_core::Slam;
 use static_cell::StaticCell;
 
-use crate::kept::{Found, Keeper, KeptTicks, Mapper, SEGMENTS};
+use crate::kept::{Found, Keeper, KeptTicks, Mapper, ROOM};
 use crate::lidar::ScanBuffer;
 use crate::trace::Tracer;
 use crate::{board, console, encoders, faults, lidar, mapping, robot, signs};
@@ -16,12 +15,13 @@ use crate::{board, console, encoders, faults, lidar, mapping, robot, signs};
 async fn main(spawner: Spawner) {
     let (mut board, cause) = board::start();
     defmt::info!(
-        "lineslam {=str} on {=str}, robot {=str}; room for {=usize} segments, {=usize} bytes of map",
+        "lineslam {=str} on {=str}, robot {=str}; room for {=usize} segments and {=usize} places, {=usize} bytes of map and odometry",
         env!("CARGO_PKG_VERSION"),
         board::NAME,
         robot::NAME,
-        SEGMENTS,
-        Slam::<SEGMENTS>::BYTES
+        ROOM[0],
+        ROOM[1],
+        Mapper::BYTES
     );
     defmt::info!("reset by {}", cause);
     faults::report();
@@ -72,7 +72,6 @@ async fn main(spawner: Spawner) {
     if let Ok(last_words) = last_words() {
         spawner.spawn(last_words);
     }
-    defmt::debug!("{=usize} bytes of map and odometry", Mapper::BYTES);
 }
 
 /// Sleeps a thousand times, 1 µs to 200 ms, and says how late it woke at the latest.

@@ -25,10 +25,13 @@ struct Motion {
 
 include!(concat!(env!("OUT_DIR"), "/set.rs"));
 
-/// Room for segments: that of the firmware.
-const CAPACITY: usize = 512;
+/// Room for segments and places: that of the firmware.
+const CAPACITY: usize = 1024;
+const PLACES: usize = 256;
+/// The URG-04LX's.
+const BEAMS: usize = 682;
 /// Segments known at the start of a run.
-const KNOWN: [usize; 3] = [50, 200, 500];
+const KNOWN: [usize; 4] = [50, 200, 500, 1000];
 /// Wheels that slip: in one of so many scans the odometry is off by this turn, radians, so that the pose must be searched for.
 const SLIP_SCANS: usize = 5;
 const SLIP_RAD: f32 = 0.4;
@@ -79,7 +82,7 @@ enum Trouble {
 
 /// The fixed set of scans through the core, with so many segments known.
 fn run(name: &str, config: SlamConfig, known: usize, trouble: Trouble) {
-    static mut SLAM: MaybeUninit<Slam<CAPACITY>> = MaybeUninit::uninit();
+    static mut SLAM: MaybeUninit<Slam<CAPACITY, BEAMS, PLACES>> = MaybeUninit::uninit();
     // SAFETY: called from the only thread there is, and never from within itself.
     let place = unsafe { &mut *core::ptr::addr_of_mut!(SLAM) };
     let Ok(slam) = Slam::new_in(place, config) else {

@@ -255,7 +255,7 @@ pub struct Difference {
 pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Option<Difference>> {
     let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
     // The sizes of `src/kept.rs`.
-    let mut mapper = Box::new(Mapper::<512, 64>::new(robot.config(), drive)?);
+    let mut mapper = Box::new(Mapper::<1024, 64, 682, 256>::new(robot.config(), drive)?);
     let known = entries.iter().take_while(|e| e.event != Event::Recovered);
     for (number, entry) in known.enumerate() {
         if entry.event == Event::Resumed {

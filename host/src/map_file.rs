@@ -117,9 +117,9 @@ impl MapFile {
     }
 
     /// Hands it to a mapper, with the robot at a pose, or anywhere.
-    pub fn hand_to<const N: usize, const K: usize, const BEAMS: usize>(
+    pub fn hand_to<const N: usize, const K: usize, const BEAMS: usize, const P: usize>(
         &self,
-        mapper: &mut Mapper<N, K, BEAMS>,
+        mapper: &mut Mapper<N, K, BEAMS, P>,
         at: Option<Isometry2<f32>>,
     ) -> Result<(), MapFileError> {
         mapper.load(&self.stored(), at).map_err(|e| MapFileError::Map(self.path.clone(), e))

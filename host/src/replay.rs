@@ -17,8 +17,9 @@ use crate::log::{Log, Odometry};
 use crate::map_file::{MapFile, MapFileError};
 use crate::robot::{Robot, Wheels};
 
-/// Map segments of the replayed `Slam`: what the firmware has.
-pub const MAP_SEGMENTS: usize = 512;
+/// Map segments and places of the replayed `Slam`: what the firmware has.
+pub const MAP_SEGMENTS: usize = 1024;
+const PLACES: usize = 256;
 /// Map segments seen in fewer scans are not yet sure: drawn thin, and not judged.
 pub const ESTABLISHED_HITS: u16 = 3;
 /// Beams of the replayed `Slam` for a URG-04LX, for what has more, and at the most.
@@ -178,7 +179,7 @@ fn run_sized<const BEAMS: usize>(
     let refused = |source| ReplayError::Config { robot: robot.name.clone(), source };
     let wheels = robot.wheels.zip(robot.drive());
     let drive = wheels.map(|(wheels, drive)| drive_of_counters(&wheels, drive));
-    let mut mapper = Mapper::<MAP_SEGMENTS, TRACK, BEAMS>::new(config, drive).map_err(refused)?;
+    let mut mapper = Mapper::<MAP_SEGMENTS, TRACK, BEAMS, PLACES>::new(config, drive).map_err(refused)?;
     if let Some(map) = &start.map {
         map.hand_to(&mut mapper, start.pose)?;
     }
@@ -235,7 +236,7 @@ fn run_sized<const BEAMS: usize>(
         local_map: slam.map().segments().to_vec(),
         map_counters: slam.map().counters(),
         counters: slam.counters(),
-        slam_bytes: Slam::<MAP_SEGMENTS, BEAMS>::BYTES,
+        slam_bytes: Slam::<MAP_SEGMENTS, BEAMS, PLACES>::BYTES,
         config,
         distance_m,
         impossible_steps: mapper.counters().impossible_steps as usize,
@@ -281,7 +282,7 @@ impl<'a> OdometryFeed<'a> {
     /// Feeds samples until one lies at or after `until_us`.
     fn advance<const BEAMS: usize>(
         &mut self,
-        mapper: &mut Mapper<MAP_SEGMENTS, TRACK, BEAMS>,
+        mapper: &mut Mapper<MAP_SEGMENTS, TRACK, BEAMS, PLACES>,
         until_us: u64,
     ) {
         while self.last.is_none_or(|(logged_us, _)| logged_us + STAMP_OFFSET_US < until_us)

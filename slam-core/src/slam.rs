@@ -26,7 +26,7 @@ pub use crate::update::{Counters, ScanRejection, SlamUpdate, Stage};
 
 /// Map, pose and working memory: room for `N` map segments, `BEAMS` beams and `P` places.
 ///
-/// RAM: [`Slam::BYTES`], about 66 bytes for each map segment, 16 for each beam, 172 for each place and 40 KiB.
+/// RAM: [`Slam::BYTES`], about 42 bytes for each map segment, 16 for each beam, 172 for each place and 40 KiB.
 pub struct Slam<const N: usize, const BEAMS: usize = 682, const P: usize = 96> {
     config: SlamConfig,
     map: SegmentMap<N>,

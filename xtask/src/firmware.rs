@@ -19,6 +19,8 @@ const ELF_FOLDER: &str = "firmware";
 pub enum Build {
     /// The one that is flashed.
     Flashed,
+    /// The same for parts with 128 KiB of RAM.
+    Small,
     /// Stops processing after a while, for the test of the watchdog.
     Hanging,
     /// Sleeps a thousand times, says how late it woke and panics, for the tests of the emulated time driver and of last words.
@@ -29,6 +31,7 @@ impl Build {
     fn name(self) -> &'static str {
         match self {
             Self::Flashed => "lineslam",
+            Self::Small => "small",
             Self::Hanging => "hang",
             Self::Sleeping => "sleeps",
         }
@@ -37,6 +40,7 @@ impl Build {
     fn features(self) -> &'static str {
         match self {
             Self::Flashed => "",
+            Self::Small => "--features small",
             Self::Hanging => "--features hang",
             Self::Sleeping => "--features sleeps",
         }

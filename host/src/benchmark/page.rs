@@ -164,7 +164,7 @@ trajectory error.";
 const COST: &str = "\
 *scans used* is what the core took in, *records skipped* what the reader passed over or could not use. *loops closed* counts
 corrections by a place seen again after a way. *scans a second* is the number of scans by the time that the core took for them, on one
-core of a PC, one log at a time; reading and drawing are not in it. *RAM of the core* is all that it has: map of 512 segments, scan,
+core of a PC, one log at a time; reading and drawing are not in it. *RAM of the core* is all that it has: map of 1024 segments, 256 places, scan,
 buffers. It does not grow.";
 
 const DATA: &str = "\

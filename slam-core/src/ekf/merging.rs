@@ -59,7 +59,7 @@ pub(super) fn merge_walls<const N: usize>(
             next += 1;
             continue;
         };
-        let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.segment().moments.inliers);
+        let inliers = |i: usize| map.segments().get(i).map_or(0, |s| s.inliers());
         let (kept, gone) = if inliers(twin) > inliers(index) { (twin, index) } else { (index, twin) };
         if let Some(updated) = update_by_twins([kept, gone], sensor, config, pose, filter, map) {
             *pose = updated;

@@ -31,8 +31,7 @@ impl Estimator {
             let Some(entry) = around.map.get_mut(index) else { continue };
             let is_local =
                 self.travelled_m - entry.seen_at_m <= config.local_m && entry.seen_at_m >= self.jumped_at_m;
-            let by =
-                if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.segment().midpoint()) };
+            let by = if is_local { *moved } else { places.moved(entry.seen_at_m, &entry.midpoint()) };
             let segment = entry.segment().transformed(&by);
             if segment.is_finite() {
                 entry.set_segment(&segment);

@@ -6,6 +6,7 @@
 use nalgebra::{Point2, Vector2};
 
 use crate::geometry::math::{max, min};
+use crate::geometry::pose::cross;
 use crate::geometry::segment::{Moments, Segment};
 
 /// Ends are kept in steps of this length along the line, metres; up to 65 m from the centroid.
@@ -58,7 +59,6 @@ impl MapSegment {
 
     /// The segment in `map`. Its weight and scatter say how sure its line is; while it is tracked with the pose, how sure it would be if the
     /// pose were known.
-    #[inline]
     pub fn segment(&self) -> Segment {
         let Self { centroid, direction, .. } = *self;
         let [from, to] = self.ends.map(|steps| centroid + direction * (f32::from(steps) * END_STEP_M));
@@ -82,7 +82,26 @@ impl MapSegment {
         (to - from) * END_STEP_M
     }
 
+    /// Point half way between the ends.
+    #[inline]
+    pub fn midpoint(&self) -> Point2<f32> {
+        let [from, to] = self.ends.map(f32::from);
+        self.centroid + self.direction * ((from + to) * (0.5 * END_STEP_M))
+    }
+
+    /// Signed distance of a point from its line, metres; positive on the free side.
+    #[inline]
+    pub fn signed_distance(&self, point: Point2<f32>) -> f32 {
+        cross(self.direction, point - self.centroid)
+    }
+
+    /// Number of points it was fitted to.
+    pub fn inliers(&self) -> u32 {
+        self.inliers
+    }
+
     /// Changes the segment, and nothing else.
+    #[inline(never)]
     pub fn set_segment(&mut self, segment: &Segment) {
         let Segment { moments, direction, start, end } = segment;
         self.centroid = moments.centroid;

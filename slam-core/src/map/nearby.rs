@@ -45,7 +45,7 @@ impl<const N: usize> Nearby<N> {
         counts: impl Fn(&MapSegment) -> bool,
     ) {
         let near = |entry: &MapSegment| {
-            let to_middle = entry.segment().midpoint().coords - pose.translation.vector;
+            let to_middle = entry.midpoint().coords - pose.translation.vector;
             let radius = reach_m + 0.5 * entry.length_m();
             to_middle.norm_squared() <= radius * radius && counts(entry)
         };

@@ -128,7 +128,7 @@ impl Shortlist {
             };
             for mapped in nearby.along(direction, wide.max_angle_rad) {
                 let Some(entry) = map.get(usize::from(mapped)) else { continue };
-                if may_be(&direction, &centroid, &entry.segment(), &wide)
+                if may_be(&direction, &centroid, entry, &wide)
                     && self.pairs.push((index as u8, mapped)).is_err()
                 {
                     return;
@@ -156,7 +156,7 @@ pub fn associate<const N: usize>(
         AssociationConfig::Bisector(config) => {
             for (index, in_base) in observed.iter().enumerate() {
                 let in_map = in_base.transformed(view.pose);
-                let score = |mapped: &Segment| bisector_distance(&in_map, mapped, config);
+                let score = |mapped: &MapSegment| bisector_distance(&in_map, &mapped.segment(), config);
                 pair_with_best(index, nearby.all().iter().copied(), map, score, pairs);
             }
             return;
@@ -176,7 +176,7 @@ pub fn associate<const N: usize>(
             continue;
         }
         let in_map = in_base.transformed(view.pose);
-        let score = |mapped: &Segment| gated_chi2(&in_map, mapped, view, config);
+        let score = |mapped: &MapSegment| gated_chi2(&in_map, mapped, view, config);
         if is_complete {
             pair_with_best(index, own.iter().map(|(_, mapped)| *mapped), map, score, pairs);
         } else {
@@ -191,12 +191,12 @@ fn pair_with_best(
     observed: usize,
     candidates: impl Iterator<Item = u16>,
     map: &[MapSegment],
-    score: impl Fn(&Segment) -> Option<f32>,
+    score: impl Fn(&MapSegment) -> Option<f32>,
     pairs: &mut VecView<Pair>,
 ) {
     let mut best: Option<(f32, usize)> = None;
     for mapped in candidates.map(usize::from) {
-        if let Some(score) = map.get(mapped).and_then(|entry| score(&entry.segment()))
+        if let Some(score) = map.get(mapped).and_then(&score)
             && best.is_none_or(|(least, _)| score < least)
         {
             best = Some((score, mapped));
@@ -209,17 +209,23 @@ fn pair_with_best(
 }
 
 /// Whether a segment with this direction and centroid passes the gates on direction and distance.
-fn may_be(direction: &Vector2<f32>, centroid: &Point2<f32>, mapped: &Segment, config: &GateConfig) -> bool {
-    direction.dot(&mapped.direction) > 0.0
-        && cross(mapped.direction, *direction).abs() <= config.max_angle_rad
-        && mapped.normal().dot(&(centroid - mapped.moments.centroid)).abs() <= config.max_distance_m
+fn may_be(
+    direction: &Vector2<f32>,
+    centroid: &Point2<f32>,
+    mapped: &MapSegment,
+    config: &GateConfig,
+) -> bool {
+    direction.dot(&mapped.direction()) > 0.0
+        && cross(mapped.direction(), *direction).abs() <= config.max_angle_rad
+        && mapped.signed_distance(*centroid).abs() <= config.max_distance_m
 }
 
 /// χ² of the pair if it passes every gate.
-fn gated_chi2(observed: &Segment, mapped: &Segment, view: &View<'_>, config: &GateConfig) -> Option<f32> {
+fn gated_chi2(observed: &Segment, mapped: &MapSegment, view: &View<'_>, config: &GateConfig) -> Option<f32> {
     if !may_be(&observed.direction, &observed.moments.centroid, mapped, config) {
         return None;
     }
+    let mapped = &mapped.segment();
     // How far the pose may be off along this wall.
     let d = mapped.direction;
     let p = view.covariance;

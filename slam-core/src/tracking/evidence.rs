@@ -21,7 +21,7 @@ impl<const N: usize> Tracker<N> {
                 continue;
             };
             let n = seen.moments.inliers as f32;
-            let distance = entry.segment().line().signed_distance(pose * seen.moments.centroid);
+            let distance = entry.signed_distance(pose * seen.moments.centroid);
             sum += n * distance * distance;
             points += n;
         }

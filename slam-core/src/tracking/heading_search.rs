@@ -121,7 +121,7 @@ pub fn shift<const N: usize>(
         let in_map = seen.transformed(from);
         for mapped in nearby.along(in_map.direction, PARALLEL_SINE) {
             let Some(entry) = map.get(usize::from(mapped)) else { continue };
-            vote(&in_map, &entry.segment(), &mut own);
+            vote(&in_map, entry, &mut own);
         }
         let weight = min(seen.moments.inliers as f32, MOST_POINTS[1]);
         for (sum, vote) in votes.iter_mut().flatten().zip(own.iter().flatten()) {
@@ -152,19 +152,19 @@ fn is_voter(seen: &Segment, observed: &[Segment]) -> bool {
 }
 
 /// Votes for the strip of shifts that lay `seen` on `mapped` and let them overlap.
-fn vote(seen: &Segment, mapped: &Segment, votes: &mut [[f32; CELLS]; CELLS]) {
-    if mapped.direction.dot(&seen.direction) < 0.0
-        || cross(mapped.direction, seen.direction).abs() > PARALLEL_SINE
-    {
+fn vote(seen: &Segment, mapped: &MapSegment, votes: &mut [[f32; CELLS]; CELLS]) {
+    let direction = mapped.direction();
+    if direction.dot(&seen.direction) < 0.0 || cross(direction, seen.direction).abs() > PARALLEL_SINE {
         return;
     }
-    let normal = perpendicular(mapped.direction);
-    let offset = normal.dot(&(seen.moments.centroid - mapped.moments.centroid));
+    let normal = perpendicular(direction);
+    let offset = mapped.signed_distance(seen.moments.centroid);
     // The corner of the grid is farthest away.
     const FARTHEST_M: f32 = (SHIFTS as f32 * 1.415 + 1.0) * SHIFT_M;
     if offset.abs() > FARTHEST_M {
         return;
     }
+    let mapped = mapped.segment();
     let (middle, half) = (mapped.along_of(seen.midpoint()), 0.5 * seen.length_m());
     let (start, end) = (mapped.along_of(mapped.start), mapped.along_of(mapped.end));
     let least = MIN_OVERLAP * min(2.0 * half, end - start);

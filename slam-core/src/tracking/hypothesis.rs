@@ -67,10 +67,11 @@ pub fn tight_score(
         let (seen, entry) =
             (observed.get(pair.observed).filter(|_| counts(pair.observed))?, map.get(pair.mapped)?);
         let in_map = seen.transformed(pose);
-        let residual = Residual::new(&in_map, &entry.segment(), pose.translation.vector.into(), line_noise)?;
+        let mapped = entry.segment();
+        let residual = Residual::new(&in_map, &mapped, pose.translation.vector.into(), line_noise)?;
         let covariance = residual.covariance + Matrix2::new(SLACK[0], 0.0, 0.0, SLACK[1]);
         let chi2 = residual.error.dot(&(covariance.try_inverse()? * residual.error));
-        let overlap = within(entry.segment().overlap_m(&in_map) / max(in_map.length_m(), 0.01), 0.0, 1.0);
+        let overlap = within(mapped.overlap_m(&in_map) / max(in_map.length_m(), 0.01), 0.0, 1.0);
         let share = max(1.0 - chi2 / MAX_CHI2, 0.0) * (0.5 + 0.5 * overlap);
         Some((seen.moments.inliers as f32 * share, share))
     };
