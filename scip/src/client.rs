@@ -513,7 +513,11 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
             }
         }
         let mut builder = InfoBuilder::default();
-        self.ask_fields(Command::Vv, &mut builder).await?;
+        match self.ask_fields(Command::Vv, &mut builder).await {
+            // Who made the sensor need not be known to measure.
+            Ok(()) | Err(ClientError::Refused { .. } | ClientError::NoReply { .. }) => {}
+            Err(error) => return Err(error),
+        }
         self.ask_fields(Command::Pp, &mut builder).await?;
         let info = builder.build().map_err(ClientError::BadInfo)?;
         self.sensor_clock = SensorClock::default();
@@ -525,8 +529,14 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
 
     /// Asks the sensor for its time. A sensor that knows no `TM` is left at that.
     async fn compare_clocks(&mut self) -> Result<(), ClientError<P::Error>> {
-        if !self.ask(Command::Tm0, REPLY_US).await?.is_fine_for(&Command::Tm0) {
-            return Ok(());
+        match self.ask(Command::Tm0, REPLY_US).await {
+            Ok(status) if status.is_fine_for(&Command::Tm0) => {}
+            Ok(_) => return Ok(()),
+            // Where the answer was lost it is in clock adjustment all the same.
+            Err(ClientError::NoReply { .. }) => {
+                return self.send(Command::Tm2).await.map_err(ClientError::Port);
+            }
+            Err(error) => return Err(error),
         }
         let mut best: Option<(u64, u64, u32)> = None;
         for _ in 0..EXCHANGES {

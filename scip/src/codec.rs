@@ -44,6 +44,36 @@ pub const fn close_sum(added: u8) -> u8 {
     added % 64 + OFFSET
 }
 
+/// What the sum of a `KEY:value;S` line covers. Sensors differ, and the vendor's library accepts the first two.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum FieldSum {
+    /// `KEY:value`, as the specification says.
+    #[default]
+    Value,
+    /// The `;` too.
+    Semicolon,
+    /// `KEY:value` but for its last character.
+    Short,
+}
+
+impl FieldSum {
+    /// All there are.
+    pub const ALL: [Self; 3] = [Self::Value, Self::Semicolon, Self::Short];
+
+    /// The sum of a line, of which `body` is `KEY:value`.
+    pub fn of(self, body: &[u8]) -> u8 {
+        match self {
+            Self::Value => sum(body),
+            Self::Semicolon => close_sum(body.iter().fold(b';', |sum, &b| sum.wrapping_add(b))),
+            Self::Short => sum(body.split_last().map_or(body, |(_, rest)| rest)),
+        }
+    }
+
+    pub(crate) const fn bit(self) -> u8 {
+        1 << self as u8
+    }
+}
+
 /// Takes the sum off a line that ends in one; `None` where it does not fit.
 pub fn without_sum(line: &[u8]) -> Option<&[u8]> {
     let (&last, body) = line.split_last()?;
@@ -74,6 +104,16 @@ mod tests {
         }
         assert_eq!(without_sum(b"00Q"), None);
         assert_eq!(without_sum(b""), None);
+    }
+
+    #[test]
+    fn sums_of_fields_cover_what_sensors_make_them_cover() {
+        // Of the specification: ARES:1024;\ and AMAX:725;o.
+        assert_eq!([FieldSum::Value.of(b"ARES:1024"), FieldSum::Value.of(b"AMAX:725")], [b'\\', b'o']);
+        for (body, wide) in [(&b"ARES:1024"[..], &b"ARES:1024;"[..]), (b"SERI:H0706400", b"SERI:H0706400;")] {
+            assert_eq!(FieldSum::Semicolon.of(body), sum(wide));
+            assert_eq!(FieldSum::Short.of(body), sum(&body[..body.len() - 1]));
+        }
     }
 
     #[test]

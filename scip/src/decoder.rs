@@ -5,9 +5,14 @@
 //! dropped whole, counted by reason, and the next empty line or echo is a new beginning.
 //!
 //! A scan counts only when its empty line has come and all its sums were right. What a sum cannot see, bits 6 and 7 of
-//! a byte, the alphabet and the length of lines do.
+//! a byte, the alphabet and the length of lines do. Lines may end with LF or with CR LF.
+//!
+//! Lines of `VV`, `PP` and `II` are taken as sensors send them: the sum covers `KEY:value`, or the `;` too, or leaves out the
+//! last character (see [`FieldSum`]), for a whole reply in the same way. A line with a sum that fits none is left out and
+//! counted, and the reply goes on: some sensors have such a line in `VV` always. What is missing then is for
+//! [`InfoBuilder`](crate::info::InfoBuilder) to say.
 
-use crate::codec::{self, DATA_CHARS, six_bits, without_sum};
+use crate::codec::{self, DATA_CHARS, FieldSum, six_bits, without_sum};
 use crate::command::{Command, Request, Steps, Width};
 use crate::reply::Status;
 
@@ -161,12 +166,14 @@ impl Decoder {
                 continue;
             }
             let whole = if direct { part } else { self.line.get(..self.len).unwrap_or(&[]) };
+            let whole = whole.strip_suffix(b"\r").unwrap_or(whole);
             self.len = 0;
             match self.parser.take(whole, ranges_mm) {
                 None => {}
                 Some(Taken::Field(request)) => {
                     let len = whole.len();
-                    let whole = if direct { part } else { self.line.get(..len).unwrap_or(&[]) };
+                    let whole = if direct { part } else { &self.line };
+                    let whole = whole.get(..len).unwrap_or(&[]);
                     // The parser has seen that the line has this form.
                     let event = field(whole).map(|field| Event::Field { request, field });
                     return (used, event);
@@ -225,13 +232,19 @@ impl Counters {
     };
 }
 
+/// Some of the [`FieldSum`]s, a bit for each.
+type FieldSums = u8;
+/// All of them.
+const ANY_SUM: FieldSums = FieldSums::MAX;
+
 /// What line comes next.
 #[derive(Clone, Copy, Debug)]
 enum State {
     Echo,
     Status(Request),
     Stamp(Request),
-    Fields(Request),
+    /// And which sums fitted all lines so far.
+    Fields(Request, FieldSums),
     Data(Data),
     End(Ending),
     /// Out of step: until an empty line or an echo.
@@ -313,9 +326,16 @@ impl Parser {
                 },
                 Err(wrong) => self.fail(wrong, line),
             },
-            State::Fields(request) if line.is_empty() => self.end(Ending::Reply(request, Status::OK)),
-            State::Fields(request) => match field_sum(line) {
-                Ok(()) => Some(Taken::Field(request)),
+            State::Fields(request, _) if line.is_empty() => self.end(Ending::Reply(request, Status::OK)),
+            State::Fields(request, sums) => match field_sums(line).map(|fitting| fitting & sums) {
+                Ok(0) => {
+                    self.counters.bad_sum = self.counters.bad_sum.wrapping_add(1);
+                    None
+                }
+                Ok(fitting) => {
+                    self.state = State::Fields(request, fitting);
+                    Some(Taken::Field(request))
+                }
                 Err(wrong) => self.fail(wrong, line),
             },
             State::End(ending) if line.is_empty() => self.end(ending),
@@ -395,7 +415,9 @@ fn after_status(request: Request, status: Status) -> State {
     let scan = match request.command {
         Command::M(..) => status == Status::SCAN,
         Command::G(..) | Command::Tm1 => status == Status::OK,
-        Command::Vv | Command::Pp | Command::Ii if status == Status::OK => return State::Fields(request),
+        Command::Vv | Command::Pp | Command::Ii if status == Status::OK => {
+            return State::Fields(request, ANY_SUM);
+        }
         _ => false,
     };
     if scan { State::Stamp(request) } else { State::End(Ending::Reply(request, status)) }
@@ -491,13 +513,12 @@ impl Data {
     }
 }
 
-/// Checks the sum of a `KEY:value;S` line, which leaves out the `;`.
-fn field_sum(line: &[u8]) -> Result<(), Wrong> {
-    let [body @ .., b';', sum] = line else { return Err(Wrong::Form) };
-    if codec::sum(body) != *sum {
-        return Err(Wrong::Sum);
-    }
-    field(line).map(|_| ()).ok_or(Wrong::Form)
+/// The [`FieldSum`]s that fit a `KEY:value;S` line.
+fn field_sums(line: &[u8]) -> Result<FieldSums, Wrong> {
+    let [body @ .., b';', last] = line else { return Err(Wrong::Form) };
+    field(line).ok_or(Wrong::Form)?;
+    let fitting = FieldSum::ALL.into_iter().filter(|kind| kind.of(body) == *last);
+    Ok(fitting.fold(0, |sums, kind| sums | kind.bit()))
 }
 
 /// Key and value of a `KEY:value;S` line.

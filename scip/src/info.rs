@@ -24,9 +24,9 @@ pub struct SensorInfo {
     pub protocol: String<TEXT>,
     /// `SERI` of `VV`.
     pub serial: String<TEXT>,
-    /// Least range, millimetres (`DMIN`). Values below are error codes.
+    /// Least range, millimetres (`DMIN`). Values below are error codes. 20 where the sensor does not say: codes are below.
     pub min_range_mm: u16,
-    /// Greatest range, millimetres (`DMAX`).
+    /// Greatest range, millimetres (`DMAX`). 65 535 where it is more, or the sensor does not say.
     pub max_range_mm: u16,
     /// Steps in 360° (`ARES`).
     pub steps_per_revolution: u16,
@@ -45,7 +45,7 @@ pub struct SensorInfo {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum InfoError {
-    /// A field did not come, or is no number from 0 to 65 535.
+    /// A field did not come whose number measuring needs, or is no number.
     Missing {
         /// Its key.
         key: &'static str,
@@ -55,7 +55,7 @@ pub enum InfoError {
         /// Its key.
         key: &'static str,
         /// What it says.
-        value: u16,
+        value: u32,
     },
 }
 
@@ -96,11 +96,14 @@ impl SensorInfo {
 #[derive(Clone, Debug, Default)]
 pub struct InfoBuilder {
     texts: [String<TEXT>; 6],
-    numbers: [Option<u16>; 7],
+    numbers: [Option<u32>; 7],
 }
 
 const TEXT_KEYS: [&str; 6] = ["MODL", "VEND", "PROD", "FIRM", "PROT", "SERI"];
+/// The limits may be missing.
 const NUMBER_KEYS: [&str; 7] = ["DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN"];
+/// Values below are codes of the protocol, whatever the sensor (SCIP 2.0, table 3).
+const CODES_MM: u16 = 20;
 
 impl InfoBuilder {
     /// Takes a field; one that no [`SensorInfo`] has is passed over.
@@ -118,30 +121,28 @@ impl InfoBuilder {
         }
     }
 
-    /// What the fields say, if they are all there and can be true. The texts of `VV` may be missing; they are empty then.
+    /// What the fields say, if those are there that measuring needs, and can be true. Texts may be missing, they are empty then;
+    /// so may the limits of the range.
     pub fn build(&self) -> Result<SensorInfo, InfoError> {
-        let mut numbers = [0; NUMBER_KEYS.len()];
-        for ((to, from), key) in numbers.iter_mut().zip(self.numbers).zip(NUMBER_KEYS) {
-            *to = from.ok_or(InfoError::Missing { key })?;
-        }
-        let [min_range_mm, max_range_mm, steps_per_revolution, first_step, last_step, front_step, rpm] =
-            numbers;
+        let [least, most, geometry @ ..] = self.numbers;
+        let [ares, amin, amax, afrt, scan] = needed(geometry)?;
+        let min_range_mm = saturated(least.unwrap_or(CODES_MM.into()));
+        let max_range_mm = saturated(most.unwrap_or(u32::MAX));
         let fits = [
-            ("DMAX", max_range_mm, max_range_mm > min_range_mm),
-            ("ARES", steps_per_revolution, steps_per_revolution > 0),
-            ("AMIN", first_step, first_step <= last_step),
+            ("DMIN", least.unwrap_or(0), min_range_mm < u16::MAX),
+            ("DMAX", most.unwrap_or(0), max_range_mm > min_range_mm),
+            ("ARES", ares, ares > 0 && ares <= u16::MAX.into()),
+            ("AMIN", amin, amin <= amax),
             // `MD` has four digits for a step; and a scan is within one revolution.
-            (
-                "AMAX",
-                last_step,
-                last_step < 10_000 && last_step - first_step.min(last_step) < steps_per_revolution,
-            ),
-            ("AFRT", front_step, (first_step..=last_step).contains(&front_step)),
-            ("SCAN", rpm, rpm > 0),
+            ("AMAX", amax, amax < 10_000 && amax - amin.min(amax) < ares),
+            ("AFRT", afrt, (amin..=amax).contains(&afrt)),
+            ("SCAN", scan, scan > 0 && scan <= u16::MAX.into()),
         ];
         if let Some(&(key, value, _)) = fits.iter().find(|(_, _, fits)| !fits) {
             return Err(InfoError::Impossible { key, value });
         }
+        let [steps_per_revolution, first_step, last_step, front_step, rpm] =
+            [ares, amin, amax, afrt, scan].map(saturated);
         let [model, vendor, product, firmware, protocol, serial] = self.texts.clone();
         Ok(SensorInfo {
             model,
@@ -159,6 +160,19 @@ impl InfoBuilder {
             revolutions_per_minute: rpm,
         })
     }
+}
+
+/// The numbers that measuring needs.
+fn needed(geometry: [Option<u32>; 5]) -> Result<[u32; 5], InfoError> {
+    let mut numbers = [0; 5];
+    for ((to, from), key) in numbers.iter_mut().zip(geometry).zip(NUMBER_KEYS.into_iter().skip(2)) {
+        *to = from.ok_or(InfoError::Missing { key })?;
+    }
+    Ok(numbers)
+}
+
+fn saturated(number: u32) -> u16 {
+    u16::try_from(number).unwrap_or(u16::MAX)
 }
 
 fn slot<'a, T>(keys: &[&str], slots: &'a mut [T], key: &str) -> Option<&'a mut T> {
@@ -232,23 +246,38 @@ mod tests {
 
     #[test]
     fn what_is_missing_or_impossible_is_named() {
-        for key in NUMBER_KEYS {
+        for key in &NUMBER_KEYS[2..] {
             assert_eq!(built((key, None)), Err(InfoError::Missing { key }));
             assert_eq!(built((key, Some("1x"))), Err(InfoError::Missing { key }));
-            assert_eq!(built((key, Some("65536"))), Err(InfoError::Missing { key }));
+            assert_eq!(built((key, Some("4294967296"))), Err(InfoError::Missing { key }));
         }
         for (key, value) in [
+            ("DMIN", 65_535),
             ("DMAX", 20),
             ("ARES", 0),
+            ("ARES", 65_536),
             ("AMIN", 726),
             ("AMAX", 10_000),
+            ("AMAX", 65_536 + 725),
             ("AFRT", 43),
             ("AFRT", 726),
             ("SCAN", 0),
+            ("SCAN", 65_536),
         ] {
             let text = std::string::ToString::to_string(&value);
             assert_eq!(built((key, Some(&text))), Err(InfoError::Impossible { key, value }));
         }
+    }
+
+    #[test]
+    fn what_measuring_does_not_need_may_be_missing_or_too_large() {
+        for missing in [None, Some("?")] {
+            assert_eq!(built(("MODL", missing)).unwrap().beams(), 682);
+            assert_eq!(built(("DMIN", missing)).unwrap().min_range_mm, 20);
+            assert_eq!(built(("DMAX", missing)).unwrap().max_range_mm, 65_535);
+        }
+        assert_eq!(built(("DMAX", Some("100000"))).unwrap().max_range_mm, 65_535);
+        assert_eq!(built(("DMAX", Some("30000"))).unwrap().max_range_mm, 30_000);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What the sensor answers: statuses, and replies written byte by byte. What reads them is the
 //! [`Decoder`](crate::Decoder).
 
-use crate::codec::{DATA_CHARS, encode, sum};
+use crate::codec::{DATA_CHARS, FieldSum, encode, sum};
 use crate::command::{BadCommand, Command, Request, Width};
 
 /// The status of a reply: two characters, or one where SCIP 1.1 is spoken or left.
@@ -125,15 +125,20 @@ impl<F: FnMut(u8)> Writer<F> {
         }
     }
 
-    /// A line `KEY:value;` of `VV`, `PP` and `II`. Its sum leaves out the `;`.
+    /// A line `KEY:value;` of `VV`, `PP` and `II`. Its sum leaves out the `;`. What is beyond 128 characters is cut.
     pub fn field(&mut self, key: &str, value: &str) -> &mut Self {
-        let colon = b":";
-        let parts = [key.as_bytes(), colon, value.as_bytes()];
-        let added = parts.iter().flat_map(|p| p.iter()).fold(0u8, |sum, &b| sum.wrapping_add(b));
-        for part in parts {
-            self.raw(part);
+        self.field_summed(key, value, FieldSum::Value)
+    }
+
+    /// The same, with a sum as some sensors make it.
+    pub fn field_summed(&mut self, key: &str, value: &str, kind: FieldSum) -> &mut Self {
+        let mut body = heapless::Vec::<u8, 128>::new();
+        for &byte in key.as_bytes().iter().chain(b":").chain(value.as_bytes()) {
+            if body.push(byte).is_err() {
+                break;
+            }
         }
-        self.raw(&[b';', crate::codec::close_sum(added), b'\n'])
+        self.raw(&body).raw(&[b';', kind.of(&body), b'\n'])
     }
 
     /// A time stamp, of which the lowest 24 bits count, milliseconds.

@@ -14,6 +14,10 @@ use rand_pcg::Pcg32;
 use crate::command::{Command, Request, Steps, Stream, Width};
 use crate::reply::{Status, Writer};
 
+mod quirks;
+
+pub use quirks::{Identity, Quirks};
+
 /// Values of a full scan.
 pub const BEAMS: usize = 682;
 /// Steps 44 to 725, each its own.
@@ -101,6 +105,8 @@ struct Running {
 pub struct SimulatedUrg {
     /// What goes wrong from now on.
     pub faults: Faults,
+    /// How it departs from the specification.
+    pub quirks: Quirks,
     rng: Pcg32,
     scip11: bool,
     clock_adjustment: bool,
@@ -131,6 +137,7 @@ impl SimulatedUrg {
     pub fn new(now_us: u64, seed: u64) -> Self {
         Self {
             faults: Faults::default(),
+            quirks: Quirks::default(),
             rng: Pcg32::new(seed, 0x5C1),
             scip11: true,
             clock_adjustment: false,
@@ -169,10 +176,10 @@ impl SimulatedUrg {
         this
     }
 
-    /// Power off and on. The faults stay.
+    /// Power off and on. Faults and quirks stay.
     pub fn power_cycle(&mut self, now_us: u64) {
-        let (faults, rng) = (self.faults, self.rng.clone());
-        *self = Self { faults, rng, ..Self::new(now_us, 0) };
+        let (faults, quirks, rng) = (self.faults, self.quirks, self.rng.clone());
+        *self = Self { faults, quirks, rng, ..Self::new(now_us, 0) };
     }
 
     /// The bit rate it sends and hears at.
@@ -309,6 +316,16 @@ impl SimulatedUrg {
         if self.scip11 && command != Command::Scip20 {
             return self.reply(now_us, |w| w.head(&request, Status::SCIP11_UNKNOWN).end());
         }
+        match (command, self.quirks.identity) {
+            (Command::Vv, Identity::Silent) => return,
+            (Command::Vv, Identity::Refused) => {
+                return self.reply(now_us, |w| w.head(&request, Status::UNDEFINED).end());
+            }
+            (Command::Tm0 | Command::Tm1 | Command::Tm2, _) if self.quirks.knows_no_clock => {
+                return self.reply(now_us, |w| w.head(&request, Status::UNDEFINED).end());
+            }
+            _ => {}
+        }
         if self.clock_adjustment && !matches!(command, Command::Tm0 | Command::Tm1 | Command::Tm2) {
             return self.reply(now_us, |w| w.head(&request, Status::UNDEFINED).end());
         }
@@ -419,51 +436,46 @@ impl SimulatedUrg {
 
     /// The fields of `VV`, `PP` and `II`.
     fn tell(&mut self, request: &Request, now_us: u64) {
-        let model = ("MODL", "URG-04LX(Hokuyo Automatic Co.,Ltd.)");
         let mut rate = String::<48>::new();
         let mut time = String::<8>::new();
         // Both have room for the longest number.
         let _ = write!(rate, "{}[bps]<-Default setting by user", self.rate);
         let _ = write!(time, "{:06X}", self.timer_ms(now_us));
-        let laser = if self.laser { "ON" } else { "OFF" };
-        let identity = [
-            ("VEND", "Hokuyo Automatic Co.,Ltd."),
-            ("PROD", "SOKUIKI Sensor URG-04LX"),
-            ("FIRM", "3.1.04(02/Aug./2007)"),
-            ("PROT", "SCIP 2.0"),
-            ("SERI", "H0000000"),
-        ];
-        let geometry = [
-            model,
-            ("DMIN", "20"),
-            ("DMAX", "5600"),
-            ("ARES", "1024"),
-            ("AMIN", "44"),
-            ("AMAX", "725"),
-            ("AFRT", "384"),
-            ("SCAN", "600"),
-        ];
         let state = [
-            model,
-            ("LASR", laser),
+            quirks::MODEL,
+            ("LASR", if self.laser { "ON" } else { "OFF" }),
             ("SCSP", "Initial(600[rpm])<-Default setting by user"),
             ("MESM", "IDLE"),
             ("SBPS", &rate),
             ("TIME", &time),
             ("STAT", "Sensor works well."),
         ];
-        let fields: &[(&str, &str)] = match request.command {
-            Command::Vv => &identity,
-            Command::Pp => &geometry,
-            _ => &state,
+        let quirks = self.quirks;
+        let geometry = quirks.geometry();
+        let (fields, skipped): (&[(&str, &str)], usize) = match request.command {
+            Command::Vv => (&quirks::IDENTITY, 0),
+            Command::Pp => (&geometry, quirks.geometry_skipped()),
+            _ => (&state, 0),
         };
         self.reply(now_us, |w| {
             w.head(request, Status::OK);
-            for (key, value) in fields {
-                w.field(key, value);
+            for (key, value) in fields.iter().skip(skipped) {
+                w.field_summed(key, value, quirks.field_sum);
             }
             w.end();
         });
+        if request.command == Command::Vv && quirks.wrong_sum {
+            self.spoil_last_sum();
+        }
+    }
+
+    /// Makes the sum of the last line of a reply that was just written a wrong one.
+    fn spoil_last_sum(&mut self) {
+        let from_end = 2 * (1 + usize::from(self.quirks.cr_lf)) + 1;
+        let at = self.queue.len().checked_sub(from_end);
+        if let Some(sum) = at.and_then(|at| self.queue.iter_mut().nth(at)) {
+            *sum = if *sum == b'I' { b'J' } else { b'I' };
+        }
     }
 
     /// Whether the scan of this revolution belongs to the stream; counts down its interval.
@@ -530,9 +542,12 @@ impl SimulatedUrg {
 
     fn reply(&mut self, now_us: u64, write: impl FnOnce(&mut Writer<&mut dyn FnMut(u8)>)) {
         self.start_sending(now_us + REPLY_DELAY_US);
-        let queue = &mut self.queue;
+        let (queue, cr_lf) = (&mut self.queue, self.quirks.cr_lf);
         // More waits than any host that listens lets wait: the rest is lost, as in the sensor.
         let mut push = |byte| {
+            if cr_lf && byte == b'\n' {
+                let _ = queue.push_back(b'\r');
+            }
             let _ = queue.push_back(byte);
         };
         write(&mut Writer::new(&mut push));
