@@ -62,9 +62,12 @@ fn constants(path: &Path) -> String {
          /// Its wheels.\n\
          pub const DRIVE: slam_core::odometry::DifferentialDrive = slam_core::odometry::{drive:?};\n\
          /// Microseconds from a scan's middle beam to the time that its stamp says.\n\
-         pub const SCAN_DELAY_US: i64 = {};\n",
+         pub const SCAN_DELAY_US: i64 = {};\n\
+         /// Bit rate to work at with the scanner, bit/s; `None` for the driver's default.\n\
+         pub const BAUD_RATE: Option<u32> = {:?};\n",
         robot.name,
         (robot.sensor.scan_delay_s * 1e6).round() as i64,
+        robot.sensor.baud_rate,
     ) + &format!(
         "/// Puts sensor, mounting and odometry into a configuration.\n\
          pub fn apply(config: &mut slam_core::SlamConfig) {{\n\

@@ -10,7 +10,7 @@ use scip::client::EmbassyClock;
 use scip::{Client, ClientConfig};
 
 use crate::board::LidarPins;
-use crate::robot::SCAN_DELAY_US;
+use crate::robot::{BAUD_RATE, SCAN_DELAY_US};
 
 /// Room for the ranges of a scan.
 pub const BEAMS: usize = 682;
@@ -69,7 +69,10 @@ pub async fn run(pins: LidarPins, mut scans: Sender<'static, CriticalSectionRawM
         defmt::error!("the lidar's port cannot be opened");
         return;
     };
-    let mut client = Client::new(port, EmbassyClock, ClientConfig::default());
+    let mut config = ClientConfig::default();
+    config.baud_rate = BAUD_RATE.unwrap_or(config.baud_rate);
+    let mut client = Client::new(port, EmbassyClock, config);
+    let mut chosen_rate = client.chosen_baud_rate();
     loop {
         let buffer = scans.send().await;
         let outcome = {
@@ -107,6 +110,10 @@ pub async fn run(pins: LidarPins, mut scans: Sender<'static, CriticalSectionRawM
                 report_absence();
                 defmt::warn!("lidar: {}", error);
             }
+        }
+        let before = core::mem::replace(&mut chosen_rate, client.chosen_baud_rate());
+        if chosen_rate != before {
+            defmt::warn!("lidar: {=u32} bit/s fails; from now on {=u32}", before, chosen_rate);
         }
         let (counters, decoded) = (client.counters(), client.decoder_counters());
         STATE.scans.store(counters.scans, Ordering::Relaxed);

@@ -110,7 +110,7 @@ fn noise_and_framing_errors_on_the_line_are_counted_and_survived() {
 #[test]
 fn a_sensor_that_streams_at_another_bit_rate_is_taken_over() {
     let (outcome, judged) = hall(Some(30), &["streaming=750000"]);
-    assert!(says(&outcome, "INFO", "500000 bit/s"));
+    assert!(says(&outcome, "INFO", "250000 bit/s"));
     assert!(judged.report.scans_used > 200);
     assert!(last_error_m(&judged) < 0.20, "{}", last_error_m(&judged));
 }

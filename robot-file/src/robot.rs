@@ -308,6 +308,24 @@ mod tests {
     }
 
     #[test]
+    fn the_bit_rate_is_one_of_the_sensor_s() {
+        let path = Path::new("robots/rover.toml");
+        let with = |rate: &str| parse(&[("[sensor]", &format!("[sensor]\nbaud_rate = {rate}"))], path);
+        assert_eq!(with("500000").unwrap().sensor.baud_rate, Some(500_000));
+        assert_eq!(parse(&[], path).unwrap().sensor.baud_rate, None);
+        assert_eq!(Robot::usual_for("simulated").sensor.baud_rate, Some(250_000));
+        for (rate, words) in [
+            ("256000", ["rover.toml: sensor.baud_rate", "256000 is none", "115200, 250000, 500000"]),
+            ("0", ["rover.toml: sensor.baud_rate", "0 is none", "19200"]),
+            ("-1", ["rover.toml", "baud_rate = -1", "integer `-1`"]),
+            ("\"fast\"", ["rover.toml", "baud_rate = \"fast\"", "u32"]),
+        ] {
+            let said = with(rate).unwrap_err();
+            assert!(words.iter().all(|word| said.contains(word)), "{words:?} are not in: {said}");
+        }
+    }
+
+    #[test]
     fn profiles_that_cannot_be_used_are_named() {
         let folder = std::env::temp_dir().join(format!("lineslam-profiles-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
@@ -316,6 +334,7 @@ mod tests {
         std::fs::write(folder.join("own.toml"), &own).unwrap();
         std::fs::write(folder.join("bad.toml"), own.replace("last = 725", "last = 4")).unwrap();
         std::fs::write(folder.join("delay.toml"), format!("scan_delay_s = 0.1\n{own}")).unwrap();
+        std::fs::write(folder.join("rate.toml"), format!("baud_rate = 250000\n{own}")).unwrap();
         let named = |name: &str| parse(&[("\"urg-04lx\"", &format!("\"{name}\""))], &path);
         let robot = named("own.toml").unwrap();
         assert_eq!(robot.config().sensor.noise.sigma_m, 0.03);
@@ -325,6 +344,7 @@ mod tests {
             ("absent.toml", &["rover.toml: sensor.profile", "absent.toml"]),
             ("bad.toml", &["bad.toml: steps.last", "4 is not above"]),
             ("delay.toml", &["delay.toml: scan_delay_s"]),
+            ("rate.toml", &["rate.toml: baud_rate", "belongs into a robot file"]),
         ] {
             let said = named(name).unwrap_err();
             assert!(words.iter().all(|word| said.contains(word)), "{words:?} are not in: {said}");

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use scip::rate::RATES;
 use serde::Deserialize;
 use slam_core::sensor::scan::{RangeCodes, ScanGeometry};
 
@@ -27,6 +28,8 @@ pub struct Sensor {
     pub(crate) line_sigma_m: f32,
     /// Time from the middle beam to the stamp logged with the scan, seconds.
     pub scan_delay_s: f64,
+    /// Bit rate at which the microcontroller works with it, bit/s, one of [`RATES`]; `None` for the driver's default.
+    pub baud_rate: Option<u32>,
     pub(crate) steps: Option<Steps>,
     pub(crate) field: Option<Field>,
 }
@@ -65,6 +68,7 @@ pub(crate) struct SensorText {
     sigma_bearing_deg: Option<f32>,
     line_sigma_m: Option<f32>,
     scan_delay_s: Option<f64>,
+    baud_rate: Option<u32>,
     steps: Option<StepsText>,
     field: Option<Field>,
 }
@@ -92,9 +96,11 @@ impl SensorText {
         let (profile, profile_path) =
             profile::read::<Self>(&name, "sensor.profile", &profile::SENSORS, path, files)?;
         let in_profile = |(key, reason)| FileError::Impossible { path: profile_path.clone(), key, reason };
-        for (key, stated) in
-            [("profile", profile.profile.is_some()), ("scan_delay_s", profile.scan_delay_s.is_some())]
-        {
+        for (key, stated) in [
+            ("profile", profile.profile.is_some()),
+            ("scan_delay_s", profile.scan_delay_s.is_some()),
+            ("baud_rate", profile.baud_rate.is_some()),
+        ] {
             if stated {
                 return Err(in_profile((key.into(), "belongs into a robot file".into())));
             }
@@ -125,8 +131,9 @@ impl SensorText {
             sigma_per_m: self.sigma_per_m.or(profile.sigma_per_m),
             sigma_bearing_deg: self.sigma_bearing_deg.or(profile.sigma_bearing_deg),
             line_sigma_m: self.line_sigma_m.or(profile.line_sigma_m),
-            // Never the profile's: it belongs to the robot.
+            // Never the profile's: they belong to the robot.
             scan_delay_s: self.scan_delay_s,
+            baud_rate: self.baud_rate,
             steps,
             field,
         }
@@ -148,6 +155,7 @@ impl SensorText {
             sigma_bearing_deg: needed("sigma_bearing_deg", self.sigma_bearing_deg)?,
             line_sigma_m: needed("line_sigma_m", self.line_sigma_m)?,
             scan_delay_s: needed("scan_delay_s", self.scan_delay_s)?,
+            baud_rate: self.baud_rate,
             steps: self.steps.map(StepsText::whole).transpose()?,
             field: self.field,
         };
@@ -182,6 +190,10 @@ impl Sensor {
         positive("line_sigma_m", self.line_sigma_m)?;
         if !(-10.0..=10.0).contains(&self.scan_delay_s) {
             return Err(("scan_delay_s".into(), format!("{} is not within ±10 s", self.scan_delay_s)));
+        }
+        if let Some(rate) = self.baud_rate.filter(|rate| !RATES.contains(rate)) {
+            let known = RATES.map(|rate| rate.to_string()).join(", ");
+            return Err(("baud_rate".into(), format!("{rate} is none of the sensor's: {known}")));
         }
         match (&self.steps, &self.field) {
             (Some(steps), None) => steps.check(),

@@ -12,6 +12,8 @@ use crate::codec::DATA_CHARS;
 use crate::command::{Command, Request, Steps, Stream, Width};
 use crate::decoder::{self, Decoder, Event, ScanHead};
 use crate::info::{InfoBuilder, InfoError, SensorInfo};
+pub use crate::rate::RATES;
+use crate::rate::RateChoice;
 use crate::reply::Status;
 use crate::time::SensorClock;
 
@@ -52,7 +54,8 @@ impl Clock for EmbassyClock {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct ClientConfig {
-    /// Bit rate to work at, bit/s. A sensor that cannot, or needs none as on USB, stays at its own.
+    /// Bit rate to work at, bit/s. A sensor that cannot, or needs none as on USB, stays at its own. Where it fails, a lower one
+    /// is chosen for good, see [`rate`](crate::rate).
     pub baud_rate: u32,
     /// Steps to measure; `None` for all that the sensor has.
     pub steps: Option<Steps>,
@@ -72,8 +75,8 @@ pub struct ClientConfig {
 impl Default for ClientConfig {
     fn default() -> Self {
         Self {
-            // The lowest that carries ten full scans of `MD` a second with a margin.
-            baud_rate: 500_000,
+            // The lowest that carries ten full scans of `MD` a second: each takes 85.5 ms. No level shifter is rated for less.
+            baud_rate: 250_000,
             steps: None,
             interval: 0,
             compare_clocks: true,
@@ -190,10 +193,9 @@ pub struct ClientCounters {
     pub port_errors: u32,
     /// Scans of other steps than asked for.
     pub foreign_scans: u32,
+    /// Times that a lower bit rate was chosen because the one before failed.
+    pub slowed: u32,
 }
-
-/// Bit rates that are tried, after the one wanted and the one that was last right.
-pub const RATES: [u32; 6] = [19_200, 57_600, 115_200, 250_000, 500_000, 750_000];
 
 /// Bytes read at once.
 const CHUNK: usize = 128;
@@ -240,7 +242,10 @@ pub struct Client<P, C> {
     /// Bytes of the chunk that are still to be decoded.
     held: Range<usize>,
     info: Option<SensorInfo>,
+    /// What is spoken now.
     rate: u32,
+    /// What is to be spoken.
+    choice: RateChoice,
     connected: bool,
     stream: Option<Stream>,
     sensor_clock: SensorClock,
@@ -249,6 +254,8 @@ pub struct Client<P, C> {
     not_before_us: u64,
     counters: ClientCounters,
     bytes: u32,
+    /// Scans dropped when the last one was handed out.
+    dropped: u32,
     errors_in_a_row: u8,
 }
 
@@ -263,6 +270,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
             held: 0..0,
             info: None,
             rate: config.baud_rate,
+            choice: RateChoice::new(config.baud_rate),
             connected: false,
             stream: None,
             sensor_clock: SensorClock::default(),
@@ -271,6 +279,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
             not_before_us: 0,
             counters: ClientCounters::default(),
             bytes: 0,
+            dropped: 0,
             errors_in_a_row: 0,
             config,
         }
@@ -300,8 +309,14 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         }
         let result = self.try_next_scan(ranges_mm).await;
         match &result {
-            Ok(_) => self.pause_us = self.config.least_pause_us,
-            Err(_) => {
+            Ok(scan) => {
+                self.pause_us = self.config.least_pause_us;
+                self.judge_rate(scan);
+            }
+            Err(error) => {
+                if self.rate == self.choice.rate() && is_of_the_rate(error) && self.choice.failed() {
+                    self.counters.slowed = self.counters.slowed.wrapping_add(1);
+                }
                 if was_connected {
                     self.counters.losses = self.counters.losses.wrapping_add(1);
                 } else {
@@ -312,6 +327,21 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
             }
         }
         result
+    }
+
+    /// Where too many scans are dropped at this bit rate, the next call connects anew at a lower one.
+    fn judge_rate(&mut self, scan: &Scan) {
+        let dropped = self.decoder.counters().scans_dropped;
+        let newly = dropped.wrapping_sub(core::mem::replace(&mut self.dropped, dropped));
+        if self.rate != self.choice.rate() {
+            return;
+        }
+        let period_us = u64::from(scan.revolution.0) * (u64::from(self.config.interval) + 1);
+        let carrying = wire_bytes(&scan.steps) * 10_000_000 / period_us.max(1);
+        if self.choice.took(newly, u32::try_from(carrying).unwrap_or(u32::MAX)) {
+            self.counters.slowed = self.counters.slowed.wrapping_add(1);
+            self.connected = false;
+        }
     }
 
     /// Stops the scans and the laser. The next scan begins anew.
@@ -328,6 +358,12 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
     /// The bit rate that is spoken now, bit/s.
     pub fn baud_rate(&self) -> u32 {
         self.rate
+    }
+
+    /// The bit rate to work at, bit/s: that of the configuration, or a lower one since that failed. Another than
+    /// [`Self::baud_rate`] where there is no connection, or the sensor cannot.
+    pub fn chosen_baud_rate(&self) -> u32 {
+        self.choice.rate()
     }
 
     /// What happened so far.
@@ -430,7 +466,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         let bytes = self.bytes;
         let errors = self.counters.port_errors;
         let mut failure = None;
-        for rate in rates(self.config.baud_rate, self.rate) {
+        for rate in rates(self.choice.rate(), self.rate) {
             match self.probe(rate).await {
                 Ok(true) => return Ok(()),
                 Ok(false) => {}
@@ -498,7 +534,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
 
     /// Bit rate, identity, clock.
     async fn set_up(&mut self) -> Result<SensorInfo, ClientError<P::Error>> {
-        let wanted = self.config.baud_rate;
+        let wanted = self.choice.rate();
         if self.rate != wanted {
             let status = self.ask(Command::Ss(wanted), REPLY_US).await?;
             if status == Status::OK {
@@ -687,6 +723,11 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
     fn clock_after(&self, pause_us: u64) -> u64 {
         self.clock.now_us().saturating_add(pause_us)
     }
+}
+
+/// Whether an error speaks against the bit rate at which it came about: the sensor is there and is not understood.
+fn is_of_the_rate<E>(error: &ClientError<E>) -> bool {
+    matches!(error, ClientError::NoReply { .. } | ClientError::Babbling)
 }
 
 /// Bit rates in the order in which they are tried, each once.

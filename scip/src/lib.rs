@@ -12,6 +12,7 @@ pub mod codec;
 pub mod command;
 pub mod decoder;
 pub mod info;
+pub mod rate;
 pub mod reply;
 #[cfg(feature = "sim")]
 pub mod sim;

@@ -12,6 +12,7 @@ use rand_core::Rng;
 use rand_pcg::Pcg32;
 
 use crate::command::{Command, Request, Steps, Stream, Width};
+use crate::rate::RATES;
 use crate::reply::{Status, Writer};
 
 mod quirks;
@@ -26,7 +27,6 @@ const STEPS_PER_REVOLUTION: u64 = 1024;
 const REVOLUTION_US: u64 = 100_000;
 /// Bit rate after power-up.
 pub const POWER_UP_RATE: u32 = 19_200;
-const RATES: [u32; 6] = crate::client::RATES;
 
 /// From power-up to the first command that is heard.
 const BOOT_US: u64 = 300_000;
@@ -36,6 +36,8 @@ const REPLY_DELAY_US: u64 = 1_000;
 const SCAN_DELAY_US: u64 = 3_000;
 /// Room for what waits to be sent: a scan and replies.
 const QUEUE: usize = 4096;
+/// Bytes that are spoilt where the line is not good for the bit rate.
+const SPOILT_ONE_IN: u32 = 25;
 /// Longest line that is heard.
 const HEARD: usize = 48;
 
@@ -62,6 +64,9 @@ pub struct Faults {
     pub babble: bool,
     /// Nothing is heard or sent, as if unplugged but powered.
     pub deaf: bool,
+    /// Above this bit rate one byte in 25 is spoilt, either way: a level shifter or a cable that is not good for more. Zero for
+    /// any.
+    pub good_to: u32,
     /// How fast the sensor's quartz is, parts per million.
     pub drift_ppm: i32,
 }
@@ -207,7 +212,9 @@ impl SimulatedUrg {
         if self.faults.deaf || now_us < self.deaf_until_us {
             return;
         }
-        let byte = if rates_agree(baud_rate, self.rate) { byte } else { self.rng.next_u32() as u8 | 0x80 };
+        let spoilt = self.is_too_fast() && self.strikes(SPOILT_ONE_IN);
+        let heard = rates_agree(baud_rate, self.rate) && !spoilt;
+        let byte = if heard { byte } else { self.rng.next_u32() as u8 | 0x80 };
         match byte {
             b'\n' | b'\r' => {
                 let line = core::mem::take(&mut self.heard);
@@ -273,7 +280,8 @@ impl SimulatedUrg {
             if self.faults.deaf || self.strikes(self.faults.lost_one_in) {
                 continue;
             }
-            if self.strikes(self.faults.garbled_one_in) {
+            let one_in = if self.is_too_fast() { SPOILT_ONE_IN } else { self.faults.garbled_one_in };
+            if self.strikes(one_in) {
                 byte ^= 1 << (self.rng.next_u32() % 8);
             }
             let sent = Sent { byte, baud_rate };
@@ -561,6 +569,10 @@ impl SimulatedUrg {
         if self.queue.is_empty() {
             self.begin_ns = self.begin_ns.max(at_us * 1000);
         }
+    }
+
+    fn is_too_fast(&self) -> bool {
+        self.faults.good_to > 0 && self.rate > self.faults.good_to
     }
 
     fn strikes(&mut self, one_in: u32) -> bool {

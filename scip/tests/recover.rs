@@ -261,6 +261,20 @@ fn a_port_that_only_fails_is_reported_in_bounded_time() {
 }
 
 #[test]
+fn scans_that_are_mostly_dropped_step_the_bit_rate_down_once() {
+    let world = World::new(SimulatedUrg::new(0, 7));
+    let config = ClientConfig { baud_rate: 500_000, ..ClientConfig::default() };
+    let mut client = Client::new(Port(world.clone()), world.clone(), config);
+    run_until(&world, &mut client, 5_000_000);
+    // Three in eight are left.
+    world.0.borrow_mut().peer.faults = Faults { wrong_sum_one_in: 2, cut_one_in: 4, ..Faults::default() };
+    let from_us = world.now_us();
+    let outcomes = run_until(&world, &mut client, from_us + 60_000_000);
+    assert_eq!((client.counters().slowed, client.baud_rate()), (1, 250_000));
+    assert!((170..290).contains(&scans(&outcomes)), "{}", scans(&outcomes));
+}
+
+#[test]
 fn found_streaming_the_client_takes_over() {
     let world = World::new(SimulatedUrg::found(0, 3, 750_000, Mode::Streaming));
     let mut client = Client::new(Port(world.clone()), world.clone(), ClientConfig::default());
