@@ -104,6 +104,11 @@ pub struct Scan {
 }
 
 impl Scan {
+    /// One revolution on the host's clock, microseconds: as measured.
+    pub fn revolution_us(&self) -> u32 {
+        self.revolution.0
+    }
+
     /// When a range was measured, on the host's clock, microseconds. Of a cluster, its first step.
     pub fn beam_us(&self, range: usize) -> u64 {
         let step = u64::from(self.steps.first) + (range * usize::from(self.steps.cluster.max(1))) as u64;
@@ -195,6 +200,8 @@ pub struct ClientCounters {
     pub foreign_scans: u32,
     /// Times that a lower bit rate was chosen because the one before failed.
     pub slowed: u32,
+    /// Scans that were not handed out because their stamps may have been more than 0.1 s off.
+    pub doubted: u32,
 }
 
 /// Bytes read at once.
@@ -376,9 +383,9 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         self.decoder.counters()
     }
 
-    /// Stamps of the sensor that were not believed, since it was last connected.
-    pub fn rejected_stamps(&self) -> u32 {
-        self.sensor_clock.rejected()
+    /// What is known of the sensor's clock, since it was last connected.
+    pub fn sensor_clock(&self) -> &SensorClock {
+        &self.sensor_clock
     }
 
     /// Gives the port back.
@@ -407,7 +414,10 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         loop {
             match self.hear(ranges_mm, None, until_us).await {
                 Some(Heard::Scan(head)) if is_of(&head, &stream) => {
-                    return self.hand_out(&head, &stream).ok_or(ClientError::NotFound);
+                    if let Some(scan) = self.hand_out(&head, &stream) {
+                        return Ok(scan);
+                    }
+                    self.counters.doubted = self.counters.doubted.wrapping_add(1);
                 }
                 Some(Heard::Scan(_)) => {
                     self.counters.foreign_scans = self.counters.foreign_scans.wrapping_add(1);
@@ -444,14 +454,16 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
         Ok(stream)
     }
 
-    /// `None` only where no sensor has said how it turns, which no stream begins without.
+    /// `None` where nobody knows well enough when the scan was.
     fn hand_out(&mut self, head: &ScanHead, stream: &Stream) -> Option<Scan> {
         let arrived_us = self.clock.now_us();
+        // No stream begins before the sensor has said how it turns.
         let info = self.info.as_ref()?;
-        let revolution = (info.revolution_us(), info.steps_per_revolution);
         let least_delay_us = info.step_us(head.steps.last)
             + wire_bytes(&head.steps) * 10_000_000 / u64::from(self.rate.max(1));
-        let stamp_us = self.sensor_clock.scan(head.stamp_ms, arrived_us, least_delay_us);
+        let stamped =
+            self.sensor_clock.scan(head.stamp_ms, arrived_us, least_delay_us, info.revolution_us())?;
+        let (stamp_us, revolution) = (stamped.at_us, (stamped.revolution_us, info.steps_per_revolution));
         if let Some(last_us) = self.last_stamp_us.replace(stamp_us) {
             let period_us = (u64::from(revolution.0) * (u64::from(stream.interval) + 1)).max(1);
             let periods = (stamp_us.saturating_sub(last_us) + period_us / 2) / period_us;

@@ -68,7 +68,7 @@ fn a_quiet_line_gives_ten_scans_a_second_with_stamps_within_two_milliseconds() {
             assert!(error_us < 2_000, "{drift_ppm} ppm: {error_us} µs at {}", scan.stamp_us);
         }
         assert_eq!(client.counters().missed, 0);
-        assert_eq!(client.rejected_stamps(), 0);
+        assert_eq!(client.sensor_clock().rejected(), 0);
         assert_eq!(client.counters().connections, 1);
     }
 }
