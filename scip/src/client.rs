@@ -19,7 +19,8 @@ use crate::time::SensorClock;
 
 /// A serial port. Its `read` must lose nothing when it is cancelled while waiting, and return as soon as there are any bytes.
 ///
-/// Errors of `read`, such as noise on the line, are counted and survived; the port must go on after one.
+/// Errors of `read` are counted and survived; the port must go on after one. What is being read when one comes, a scan, say, is
+/// dropped: bytes of it are wrong or missing. Noise on a byte that is right all the same is better not reported.
 pub trait SerialPort: Read + Write {
     /// Changes the bit rate of both directions, at once.
     fn set_baud_rate(&mut self, bits_per_second: u32) -> Result<(), Self::Error>;
@@ -194,7 +195,7 @@ pub struct ClientCounters {
     pub connections: u32,
     /// Times that a connection was lost.
     pub losses: u32,
-    /// Errors of the port.
+    /// Errors of the port, each of which costs what was being read.
     pub port_errors: u32,
     /// Scans of other steps than asked for.
     pub foreign_scans: u32,
@@ -690,6 +691,7 @@ impl<P: SerialPort, C: Clock> Client<P, C> {
             }
             Either::First(_) => {
                 self.counters.port_errors = self.counters.port_errors.wrapping_add(1);
+                self.decoder.abandon();
                 self.errors_in_a_row += 1;
                 // Noise is read over at once. A port that has nothing but errors must not keep us busy.
                 if self.errors_in_a_row >= ERRORS {

@@ -69,6 +69,8 @@ pub struct Faults {
     pub good_to: u32,
     /// How fast the sensor's quartz is, parts per million.
     pub drift_ppm: i32,
+    /// How much longer a revolution takes than it should, parts per million.
+    pub slow_ppm: i32,
 }
 
 /// How a sensor may be found.
@@ -205,6 +207,16 @@ impl SimulatedUrg {
     /// Sets the timer, so that its next stamps are near this, milliseconds.
     pub fn set_timer_ms(&mut self, now_us: u64, timer_ms: u32) {
         self.timer_zero_us = now_us.wrapping_sub(u64::from(timer_ms) * 1000);
+    }
+
+    /// Sets the timer ahead, or back.
+    pub fn shift_timer_ms(&mut self, by_ms: i64) {
+        self.timer_zero_us = self.timer_zero_us.wrapping_add_signed(-by_ms * 1000);
+    }
+
+    /// One revolution now, microseconds.
+    pub fn revolution_us(&self) -> u64 {
+        self.period_us()
     }
 
     /// Takes a byte that the host has sent at that bit rate. At another than the sensor's it is heard as something else.
@@ -585,7 +597,8 @@ impl SimulatedUrg {
 
     /// A revolution at this speed: each level is 1 % slower.
     fn period_us(&self) -> u64 {
-        REVOLUTION_US * 100 / (100 - u64::from(self.speed))
+        let set = REVOLUTION_US * 100 / (100 - u64::from(self.speed));
+        set.saturating_add_signed(set as i64 * i64::from(self.faults.slow_ppm) / 1_000_000)
     }
 
     fn sweep_end_us(&self) -> u64 {
@@ -594,8 +607,8 @@ impl SimulatedUrg {
 
     fn timer_ms(&self, at_us: u64) -> u32 {
         let us = at_us.wrapping_sub(self.timer_zero_us) as i64;
-        let drift = us / 1_000_000 * i64::from(self.faults.drift_ppm);
-        (us + drift).div_euclid(1000) as u32 & 0xFF_FFFF
+        let drift = i128::from(us) * i128::from(self.faults.drift_ppm) / 1_000_000;
+        (us + drift as i64).div_euclid(1000) as u32 & 0xFF_FFFF
     }
 }
 

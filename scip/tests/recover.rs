@@ -73,6 +73,72 @@ fn a_quiet_line_gives_ten_scans_a_second_with_stamps_within_two_milliseconds() {
     }
 }
 
+/// How far a stamp is from where the ranges say that the scan was.
+fn error_us(scan: &scip::Scan, ranges: &[u16; BEAMS]) -> u64 {
+    let begin_us = u64::from(ranges[0] - 20) * 1000;
+    // The ranges tell it modulo 5.58 s.
+    let off_us = (scan.stamp_us % 5_580_000).abs_diff(begin_us);
+    off_us.min(5_580_000 - off_us)
+}
+
+/// Scans until an instant, which must all come without an error and in order; their errors.
+fn errors_until(world: &World<SimulatedUrg>, client: &mut UrgClient, until_us: u64) -> Vec<u64> {
+    let (mut errors, mut last_us) = (Vec::new(), 0);
+    while world.now_us() < until_us {
+        let mut ranges = [0; BEAMS];
+        let scan = world.run(client.next_scan(&mut ranges)).expect("a scan");
+        assert!(scan.stamp_us > last_us, "out of order");
+        last_us = scan.stamp_us;
+        errors.push(error_us(&scan, &ranges));
+    }
+    errors
+}
+
+#[test]
+fn a_host_on_an_rc_oscillator_has_its_stamps_right_within_four_milliseconds() {
+    for drift_ppm in [-10_000, 10_000] {
+        let (world, mut client) = driving(Faults { drift_ppm, ..Faults::default() });
+        run_until(&world, &mut client, 5_000_000);
+        let errors = errors_until(&world, &mut client, 125_000_000);
+        assert_eq!(errors.len(), 1200);
+        assert!(errors.iter().all(|us| *us < 4_000), "{drift_ppm} ppm: {:?}", errors.iter().max());
+        assert!((client.sensor_clock().skew_ppm() + drift_ppm as f32).abs() < 200.0);
+    }
+}
+
+#[test]
+fn a_sensor_s_clock_that_is_set_costs_two_scans_at_most_and_no_wrong_stamp() {
+    for by_ms in [-600_000, 600_000, -40, 40, 100, -100] {
+        let (world, mut client) = driving(Faults::default());
+        run_until(&world, &mut client, 10_000_000);
+        world.0.borrow_mut().peer.shift_timer_ms(by_ms);
+        let from_us = world.now_us();
+        let errors = errors_until(&world, &mut client, from_us + 10_000_000);
+        assert!(errors.len() >= 97, "{by_ms} ms: {} scans", errors.len());
+        assert!(errors.iter().all(|us| *us < 100_000), "{by_ms} ms: {errors:?}");
+        assert!(errors[2..].iter().all(|us| *us < 3_000), "{by_ms} ms: {errors:?}");
+        let clock = client.sensor_clock();
+        assert_eq!((clock.jumps(), client.counters().losses), (1, 0), "{by_ms} ms");
+        println!("{by_ms} ms: {} doubted", client.counters().doubted);
+    }
+}
+
+#[test]
+fn a_motor_that_wanders_is_measured_and_misses_no_scan() {
+    let (world, mut client) = driving(Faults::default());
+    run_until(&world, &mut client, 5_000_000);
+    for slow_ppm in (0..60).map(|k: i32| 30_000 - (k - 30).abs() * 1_000) {
+        world.0.borrow_mut().peer.faults.slow_ppm = slow_ppm;
+        for _ in 0..20 {
+            let mut ranges = [0; BEAMS];
+            let scan = world.run(client.next_scan(&mut ranges)).unwrap();
+            let truth_us = 100_000 + slow_ppm / 10;
+            assert!((scan.revolution_us() as i32 - truth_us).abs() < 300, "{scan:?} at {slow_ppm} ppm");
+        }
+    }
+    assert_eq!(client.counters().missed, 0);
+}
+
 #[test]
 fn one_garbled_byte_in_ten_thousand_costs_single_scans_and_no_connection() {
     let (world, mut client) = driving(Faults::default());

@@ -134,6 +134,12 @@ impl<const N: usize, const K: usize, const BEAMS: usize, const P: usize> Mapper<
         self.slam.set_sensor(sensor)
     }
 
+    /// How long a revolution of the scanner takes, as measured, microseconds: to be said before each scan where it is known, see
+    /// [`Slam::set_revolution_us`]. By it the motion within a scan is taken out.
+    pub fn set_revolution_us(&mut self, revolution_us: u32) {
+        self.slam.set_revolution_us(revolution_us);
+    }
+
     /// Takes a saved map, see [`Slam::load`].
     pub fn load(&mut self, map: &StoredMap<'_>, at: Option<Isometry2<f32>>) -> Result<(), MapError> {
         self.slam.load(map, at)

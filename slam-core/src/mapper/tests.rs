@@ -284,3 +284,28 @@ fn without_odometry_a_scan_may_have_come_from_as_far_as_a_robot_drives() {
     }
     assert_eq!(mapper.slam().counters().scans, 2);
 }
+
+#[test]
+fn a_revolution_that_is_measured_is_what_the_sweep_takes() {
+    let mut mapper = mapper();
+    (0..60).for_each(|k| mapper.push(ticks(k)));
+    // Where the base was at the first beam, in the base at the middle one, by the speed alone.
+    let first_x = |mapper: &Mapper<64, 64>| {
+        mapper.motion(150_000).unwrap().middle_from_knot[0].translation.x / (STEP_M / 5_000.0)
+    };
+    let half_sweep_us = |revolution_us: f32| 681.0 / 1024.0 * revolution_us / 2.0;
+    assert!((first_x(&mapper) + half_sweep_us(100_000.0)).abs() < 5.0, "{}", first_x(&mapper));
+    for measured_us in [97_000, 103_000] {
+        mapper.set_revolution_us(measured_us);
+        let expected_us = half_sweep_us(measured_us as f32);
+        assert!((first_x(&mapper) + expected_us).abs() < 5.0, "{} {expected_us}", first_x(&mapper));
+    }
+    mapper.set_revolution_us(0);
+    assert_eq!(mapper.slam().config().sensor.geometry.revolution_us, 103_000);
+    // A scanner whose beams count as simultaneous stays one.
+    let mut sensor = mapper.slam().config().sensor;
+    sensor.geometry.revolution_us = 0;
+    mapper.set_sensor(sensor).unwrap();
+    mapper.set_revolution_us(100_000);
+    assert_eq!(first_x(&mapper), 0.0);
+}

@@ -50,6 +50,15 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         Ok(())
     }
 
+    /// How long a revolution of the scanner takes now, microseconds; zero is not taken. A scanner all of whose beams are taken as
+    /// simultaneous stays one.
+    pub fn set_revolution_us(&mut self, revolution_us: u32) {
+        let known = &mut self.config.sensor.geometry.revolution_us;
+        if *known > 0 && revolution_us > 0 {
+            *known = revolution_us;
+        }
+    }
+
     pub(crate) fn check(config: &SlamConfig) -> Result<(), ConfigError> {
         config.validate()?;
         let beams = config.sensor.geometry.beams();
