@@ -142,10 +142,10 @@ impl SensorClock {
         let mut filter = self
             .filter
             .unwrap_or_else(|| Filter::from_arrival(arrived - least_us - sensor_us, least_us, arrived_us));
-        if core::mem::take(&mut self.fresh) {
-            filter.expect_delay(least_us);
-        }
         filter.predict(arrived_us);
+        if core::mem::take(&mut self.fresh) {
+            filter.expect_delay(least_us, arrived - sensor_us);
+        }
         let (surprise_us, sigma_us) = filter.surprise(arrived - sensor_us);
         let at_us = if surprise_us.abs() <= (DOUBT_SIGMAS * sigma_us).clamp(DOUBT_US, MOST_DOUBT_US) {
             // After a stamp that was wrong for certain, one right one may be a wrong one read late.
@@ -199,13 +199,15 @@ impl SensorClock {
         let length_us = revolution.length_us();
         // A clock set ahead makes a scan seem to arrive early, and its stamp lie behind the line.
         let apart_us = within_half(off_us + surprise_us, length_us).abs();
-        let near = surprise_us.abs() < COUNTED_US;
-        let agreed = revolution.is_learnt() && near && !on_line && apart_us < AGREED_US;
         let same = self.doubt.filter(|doubt| (doubt.surprise_us - surprise_us).abs() < DOUBT_US);
+        // They cannot tell a scan that was read whole revolutions late: not after another that was odd in another way.
+        let plain = surprise_us.abs() < COUNTED_US && self.doubt.is_none() == same.is_none();
+        let agreed = revolution.is_learnt() && plain && !on_line && apart_us < AGREED_US;
         let scans = same.map_or(1, |doubt| doubt.scans + 1);
         if agreed || scans >= STUBBORN {
             self.doubt = None;
-            if on_line && surprise_us.abs() < 0.5 * length_us {
+            // At first more likely the one scan was late by which the delay is known.
+            if (on_line || !revolution.is_learnt()) && surprise_us.abs() < 0.5 * length_us {
                 filter.step_delay(surprise_us);
                 revolution.take(sensor_us);
             } else {

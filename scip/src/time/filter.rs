@@ -16,6 +16,8 @@ const SKEW_US_PER_S: f32 = 5_000.0;
 const WANDER: f32 = 30.0;
 /// Standard deviation of what the sensor adds to the least delay.
 const DELAY_US: f32 = 10_000.0;
+/// No sensor adds more, microseconds.
+const MOST_MORE_US: i64 = 500_000;
 /// Standard deviation of an offset that was set anew from an arrival.
 const ANEW_US: f32 = 3_000.0;
 
@@ -61,9 +63,12 @@ impl Filter {
         }
     }
 
-    /// Says what the delay is thought to be, where nothing has arrived yet.
-    pub(super) fn expect_delay(&mut self, least_us: i64) {
-        self.delay_us = least_us as f32 + 0.5 * DELAY_US;
+    /// The first arrival after an exchange: the delay is what it says, if that can be. Over USB it is far less than the bit rate has
+    /// one think.
+    pub(super) fn expect_delay(&mut self, least_us: i64, difference_us: i64) {
+        let seen_us = difference_us - self.offset_us();
+        let can_be = (0..least_us + MOST_MORE_US).contains(&seen_us);
+        self.delay_us = if can_be { seen_us as f32 } else { least_us as f32 + 0.5 * DELAY_US };
     }
 
     pub(super) fn offset_us(&self) -> i64 {

@@ -167,6 +167,26 @@ fn a_scan_read_late_keeps_its_stamp_and_is_no_jump() {
 }
 
 #[test]
+fn over_usb_or_with_a_first_scan_read_late_the_exchange_holds() {
+    // Read 75 ms after the stamp, where the bit rate has one think of 256; the first one later still.
+    for first_late_us in [0, 45_000] {
+        let mut clock = SensorClock::default();
+        assert!(clock.exchange(500_000, 502_000, 501));
+        let mut came = 0;
+        for k in 10..200u64 {
+            let at = k * 100_000;
+            let late_us = if k == 10 { first_late_us } else { k * 7919 % 2_000 };
+            let stamped = clock.scan((at / 1000) as u32, at + 75_000 + late_us, 256_000, 100_000);
+            if let Some(stamped) = stamped {
+                assert!(stamped.at_us.abs_diff(at) < 4_000, "{k}: {}", stamped.at_us);
+                came += 1;
+            }
+        }
+        assert!(came >= 188, "{first_late_us}: {came}");
+    }
+}
+
+#[test]
 fn jumps_are_noticed_in_three_scans_whatever_their_size() {
     for ms in [-600_000, 600_000, -40, 40, -100, 100, -250, 30, -30, 1_000, -3_600_000, 402_000] {
         let line = Line { jitter_us: 2_000.0, jumps: [(200, ms)].into(), ..Line::QUIET };
