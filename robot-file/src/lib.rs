@@ -3,6 +3,7 @@
 #![forbid(unsafe_code)]
 #![deny(missing_docs)]
 
+pub mod encoders;
 pub mod odometry;
 pub mod profile;
 pub mod robot;

@@ -11,6 +11,7 @@ use slam_core::geometry::pose::pose;
 use slam_core::odometry::{DifferentialDrive, ticks_between_u16, ticks_between_u32};
 use slam_core::sensor::scan::{Mounting, RangeNoise, ScanGeometry, SensorConfig};
 
+use crate::encoders::EncoderInputs;
 use crate::odometry::{NoiseFile, NoiseText};
 use crate::sensor::{Sensor, SensorText};
 use crate::toml_file::{self, FileError, Impossible, finite, positive};
@@ -22,6 +23,8 @@ pub struct Robot {
     pub name: String,
     /// Wheels and encoders; logs that bring poses need none.
     pub wheels: Option<Wheels>,
+    /// How the microcontroller takes in the encoders' lines.
+    pub encoders: EncoderInputs,
     /// Growth of the odometry's uncertainty.
     pub odometry_noise: NoiseFile,
     /// The scanner.
@@ -40,6 +43,8 @@ pub struct Robot {
 struct RobotText {
     name: String,
     wheels: Option<Wheels>,
+    #[serde(default)]
+    encoders: EncoderInputs,
     odometry_noise: NoiseText,
     sensor: SensorText,
     mounting: MountingFile,
@@ -55,7 +60,8 @@ pub struct Wheels {
     pub right_radius_m: f32,
     /// Distance between the wheels, metres.
     pub track_m: f32,
-    /// Counter steps for one turn of a wheel.
+    /// Counter steps for one turn of a wheel: all edges of both lines are counted, so four times an encoder's lines (its "PPR"), times
+    /// the gear between encoder and wheel.
     pub ticks_per_turn: f32,
     /// Width of the counters, after which they wrap: 16 or 32.
     pub counter_bits: u8,
@@ -146,15 +152,17 @@ impl Robot {
 
     /// Checks a text that stands in a robot file. Profiles that are files are looked for from there.
     pub fn parse(text: &str, path: &Path) -> Result<Self, FileError> {
-        let RobotText { name, wheels, odometry_noise, sensor, mounting } =
+        let RobotText { name, wheels, encoders, odometry_noise, sensor, mounting } =
             toml_file::deserialize(text, path)?;
         let impossible = |(key, reason)| FileError::Impossible { path: path.to_owned(), key, reason };
         wheels.as_ref().map_or(Ok(()), Wheels::check).map_err(impossible)?;
+        encoders.check().map_err(impossible)?;
         mounting.check().map_err(impossible)?;
         let mut profile_files = Vec::new();
         Ok(Self {
             name,
             wheels,
+            encoders,
             odometry_noise: odometry_noise.complete(path, &mut profile_files)?,
             sensor: sensor.complete(path, &mut profile_files)?,
             mounting,
@@ -265,6 +273,7 @@ impl Robot {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::encoders::Pull;
 
     const MINES: &str = include_str!("../../robots/mines.toml");
 
@@ -321,6 +330,33 @@ mod tests {
             ("\"fast\"", ["rover.toml", "baud_rate = \"fast\"", "u32"]),
         ] {
             let said = with(rate).unwrap_err();
+            assert!(words.iter().all(|word| said.contains(word)), "{words:?} are not in: {said}");
+        }
+    }
+
+    #[test]
+    fn encoders_have_pull_ups_and_a_filter_unless_the_file_says_otherwise() {
+        let path = Path::new("robots/rover.toml");
+        let with = |keys: &str| {
+            parse(&[("[odometry_noise]", &format!("[encoders]\n{keys}\n[odometry_noise]"))], path)
+        };
+        assert_eq!(parse(&[], path).unwrap().encoders, EncoderInputs { pull: Pull::Up, filter_us: 5.0 });
+        assert_eq!(
+            with("pull = \"none\"").unwrap().encoders,
+            EncoderInputs { pull: Pull::None, filter_us: 5.0 }
+        );
+        assert_eq!(
+            with("pull = \"down\"\nfilter_us = 0").unwrap().encoders,
+            EncoderInputs { pull: Pull::Down, filter_us: 0.0 }
+        );
+        for (keys, words) in [
+            ("filter_us = 12.0", &["rover.toml: encoders.filter_us", "12 is above 11.3"][..]),
+            ("filter_us = -1.0", &["rover.toml: encoders.filter_us", "-1 is below zero"]),
+            ("filter_us = nan", &["rover.toml: encoders.filter_us", "NaN"]),
+            ("pull = \"sideways\"", &["rover.toml", "sideways", "pull"]),
+            ("filtre_us = 1.0", &["rover.toml", "filtre_us"]),
+        ] {
+            let said = with(keys).unwrap_err();
             assert!(words.iter().all(|word| said.contains(word)), "{words:?} are not in: {said}");
         }
     }
