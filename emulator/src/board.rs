@@ -1,22 +1,25 @@
 //! The NUCLEO-F429ZI as the emulator builds it: the part, its crystal's clock, its supply, and what hangs on its pins.
 
 use std::num::{NonZeroU32, NonZeroU64};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, ensure};
 use rigless::chip::Timeline;
 use rigless::chip::uart::Peer;
 use rigless::cpu::armv7m::windows;
-use rigless::device::Level;
+use rigless::device::{Device, Level};
 use rigless::machine::{Board, Crystal, Supply, Target, armv7m};
 use rigless::mcu::{Mcu, Operate};
 use rigless::snapshot::Store;
 use rigless::soc::Error;
 use rigless::soc::stm32f427::Stm32f427;
+use rigless::soc::stm32f427::generated::rcc::{Register as Rcc, cir, cr};
 use rigless::soc::stm32f427::generated::tim2::Register as Tim2;
 use rigless::soc::stm32f427::peripherals::gpio::Pin;
 use rigless::time::VirtualNanos;
 
+use crate::nmi;
 use crate::paced::Pace;
 use crate::room::Room;
 
@@ -51,6 +54,12 @@ pub const TIME_DRIVER_EGR: u64 = 0x4000_0014;
 pub const FLASH_ACR: u64 = 0x4002_3C00;
 /// Its bits that turn on reading ahead and keeping code and constants.
 pub const FLASH_ACCELERATED: u64 = 0b111 << 8;
+/// `CR` of the clock controller.
+pub const RCC_CR: u64 = 0x4002_3800;
+/// The debug unit's bits that stop timers and watchdogs while a debugger holds the core.
+pub const DBGMCU_APB1_FZ: u64 = 0xE004_2008;
+/// The mask of the external interrupts, and the bit of the voltage detector's line.
+pub const EXTI_IMR: (u64, u64) = (0x4001_3C00, 1 << 16);
 /// `BRR` of USART6.
 pub const URG_BRR: u64 = 0x4001_1408;
 
@@ -70,6 +79,12 @@ pub struct Nucleo {
     pub mcu: Stm32f427,
     instructions_per_second: NonZeroU64,
     pace: Option<Pace>,
+    /// The ST-LINK gives no clock.
+    hse_dead: bool,
+    /// Raised by the clock security system.
+    nmi: Arc<AtomicBool>,
+    /// The voltage detector's interrupt is on.
+    pub pvd_armed: bool,
 }
 
 impl Nucleo {
@@ -78,13 +93,27 @@ impl Nucleo {
         let instructions_per_second = NonZeroU64::new(per_second).context("a core that stands")?;
         let mut mcu = Stm32f427::new()?;
         mcu.set_supply(Supply(3300).0);
-        Ok(Self { mcu, instructions_per_second, pace })
+        Ok(Self {
+            mcu,
+            instructions_per_second,
+            pace,
+            hse_dead: false,
+            nmi: Arc::default(),
+            pvd_armed: false,
+        })
     }
 
     /// Powered and wired, not yet running. Without a pace each instruction takes as long as the next.
     pub fn new(shared: Shared, pace: Option<Pace>) -> Result<Self, Error> {
         let instructions_per_second = if pace.is_some() { CLOCK_HZ } else { INSTRUCTIONS_PER_SECOND };
-        let mut board = Self { mcu: Stm32f427::new()?, instructions_per_second, pace };
+        let mut board = Self {
+            mcu: Stm32f427::new()?,
+            instructions_per_second,
+            pace,
+            hse_dead: false,
+            nmi: Arc::default(),
+            pvd_armed: false,
+        };
         board.mcu.rcc.attach_crystals(8_000_000, Crystal::NONE.0);
         board.mcu.set_supply(Supply(3300).0);
         board.mcu.usart[URG_PORT].attach(Urg { shared: shared.clone() });
@@ -98,6 +127,34 @@ impl Nucleo {
         errors.seed = seed;
         (errors.noise.name, errors.noise.per_million) = ("urg.noise", noise);
         (errors.framing.name, errors.framing.per_million) = ("urg.framing", framing);
+    }
+
+    /// Has the ST-LINK give no clock.
+    pub fn kill_hse(&mut self) {
+        self.mcu.rcc.attach_crystals(0, Crystal::NONE.0);
+        self.hse_dead = true;
+    }
+
+    /// Stops the ST-LINK's clock while the part runs. Where the clock security system watches, the part goes over to its own
+    /// oscillator and has a non-maskable interrupt, which the part's model leaves out.
+    pub fn stop_hse(&mut self, at: VirtualNanos) {
+        self.mcu.drive_clocks(at, |rcc, registers, context| rcc.fail_hse(registers, context));
+        let (_, registers) = self.mcu.clocks();
+        self.nmi.store(cir::CSSF.is_set(registers.get(Rcc::Cir)), Ordering::Relaxed);
+        self.kill_hse();
+    }
+
+    /// Undoes what the clock controller's model does and the silicon does not: it says that an oscillator is ready with nothing
+    /// on its pins. To be called after each write to its `CR`.
+    pub fn hold_hse(&mut self, at: VirtualNanos) {
+        if !self.hse_dead {
+            return;
+        }
+        self.mcu.drive_clocks(at, |rcc, registers, context| {
+            let off = cr::HSEON.set(registers.get(Rcc::Cr), 0);
+            registers.set(Rcc::Cr, off);
+            rcc.write(Rcc::Cr, off, registers, context);
+        });
     }
 
     /// Levels of an encoder's two lines, for the left and the right wheel.
@@ -175,6 +232,7 @@ impl Board for Nucleo {
             armv7m::Fpu::FpV4Sp,
             armv7m::MpuRegions::Eight,
         );
+        let core = nmi::wire(core, self.nmi.clone());
         let core = match &self.pace {
             Some(pace) => pace.apply(core),
             None => core,

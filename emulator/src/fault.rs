@@ -6,6 +6,7 @@ use rigless::emulator::{Host, Stop};
 use rigless::session::Session;
 
 use crate::board::{Nucleo, Shared};
+use crate::board_fault::BoardFault;
 use crate::room::Room;
 
 /// One fault. From the command line: `unplug@20+5` (seconds: when, how long; plugged in again it powers up),
@@ -42,6 +43,8 @@ pub enum Fault {
     },
     /// Stamps of the sensor wrap soon.
     StampWrap,
+    /// Something of the board's own.
+    Board(BoardFault),
 }
 
 impl FromStr for Fault {
@@ -68,11 +71,24 @@ impl FromStr for Fault {
         if text == "stamp-wrap" {
             return Ok(Self::StampWrap);
         }
-        Err("expected unplug@S+S, garble=N, line=N, streaming=BIT/S, reset@S or stamp-wrap".into())
+        if let Ok(fault) = text.parse() {
+            return Ok(Self::Board(fault));
+        }
+        Err("expected unplug@S+S, garble=N, line=N, streaming=BIT/S, reset@S, stamp-wrap, hse-dead, hse-dies@S, power@S=PERMILLE, \
+             sag@S+S, probe-gone@S+S, hold@S+S, order@S=N or glitch=NS"
+            .into())
     }
 }
 
 impl Fault {
+    /// The board's own, if it is one.
+    pub fn of_board(&self) -> Option<BoardFault> {
+        match *self {
+            Self::Board(fault) => Some(fault),
+            _ => None,
+        }
+    }
+
     /// What it is from the beginning.
     pub fn prepare(&self, room: &mut Room, seed: u64) {
         match *self {
@@ -80,14 +96,16 @@ impl Fault {
             Self::Streaming { baud_rate } => room.already_streaming(baud_rate, seed),
             // 20 s before the 24 bits are full.
             Self::StampWrap => room.urg.set_timer_ms(0, 0xFF_FFFF - 20_000),
-            Self::Unplug { .. } | Self::Line { .. } | Self::Reset { .. } => {}
+            Self::Unplug { .. } | Self::Line { .. } | Self::Reset { .. } | Self::Board(_) => {}
         }
     }
 
     /// What it is from the beginning, on the board.
     pub fn prepare_board(&self, board: &mut Nucleo, seed: u64) {
-        if let Self::Line { per_million } = *self {
-            board.set_line_errors(per_million, per_million, seed);
+        match *self {
+            Self::Line { per_million } => board.set_line_errors(per_million, per_million, seed),
+            Self::Board(fault) => fault.prepare(board),
+            _ => {}
         }
     }
 

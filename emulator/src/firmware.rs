@@ -15,6 +15,8 @@ pub struct Symbols {
     pub rtt: u64,
     /// The record of what was done to the map.
     pub trace: u64,
+    /// Where a firmware that does so looks for orders.
+    pub order: Option<u64>,
     /// Bytes of all variables.
     pub static_bytes: u64,
 }
@@ -30,6 +32,7 @@ impl Symbols {
         Ok(Self {
             rtt: address_of(RTT, elf, path)?,
             trace: address_of("TRACE", elf, path)?,
+            order: file.symbol_by_name("ORDER").map(|symbol| symbol.address()),
             static_bytes: variables.sum(),
         })
     }

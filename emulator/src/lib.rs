@@ -5,9 +5,11 @@
 
 pub mod bench;
 pub mod board;
+pub mod board_fault;
 pub mod cycles;
 pub mod fault;
 pub mod firmware;
+pub mod nmi;
 pub mod paced;
 pub mod record;
 pub mod report;

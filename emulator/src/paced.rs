@@ -12,6 +12,54 @@ use rigless::time::VirtualNanos;
 
 use crate::cycles::{Model, Program, Tally};
 
+/// What a wrapper of a core passes on to its `inner` one as it is.
+macro_rules! pass_on {
+    () => {
+        delegate::delegate! {
+            to self.inner {
+                fn ask(&mut self, queued: Queued);
+                fn maps(&self, start: u64, length: u64) -> bool;
+                fn page_size(&self) -> u64;
+                fn boot(&mut self, table: u64, read: &dyn Fn(u64, Width) -> Option<u64>);
+                fn reset(&mut self);
+                fn take_reset_request(&mut self) -> bool;
+                fn next_event(&self) -> Option<VirtualNanos>;
+                fn on_event(&mut self, now: VirtualNanos);
+                fn waiting(&self) -> bool;
+                fn pc(&self) -> u64;
+                fn add_breakpoint(&mut self, address: u64) -> bool;
+                fn remove_breakpoint(&mut self, address: u64);
+                fn pass_breakpoint(&mut self, address: u64);
+                fn attach_debugger(&mut self, attached: bool);
+                fn hold_interrupts(&mut self, held: bool);
+                fn gdb_register(&self, number: usize) -> Option<Vec<u8>>;
+                fn set_gdb_register(&mut self, number: usize, bytes: &[u8]) -> bool;
+                fn debugger_access(
+                    &mut self,
+                    write: Option<u64>,
+                    address: u64,
+                    width: Width,
+                    now: VirtualNanos,
+                ) -> Option<u64>;
+                fn take_debugger_trace(&mut self) -> Vec<u8>;
+                fn target_xml(&self) -> &'static str;
+                fn data_model(&self) -> DataModel;
+                fn byte_order(&self, address: u64) -> Endian;
+                fn save(&self) -> Vec<u8>;
+                fn monitor_command(&mut self, command: &str) -> Option<String>;
+                fn debugger_halted(&mut self, why: HaltReason) -> bool;
+                fn bit_alias(&self, address: u64, width: Width) -> Option<BitAlias>;
+                fn own_ranges(&self) -> Vec<std::ops::Range<u64>>;
+                fn check_reads(&mut self, every: bool);
+                fn check_words(&mut self, words: &[u64]);
+                fn host_call(&self, read: &mut dyn FnMut(u64, Width) -> Option<u64>) -> Option<HostCall>;
+                fn answer_host_call(&mut self, answer: Option<u64>);
+            }
+        }
+    };
+}
+pub(crate) use pass_on;
+
 /// The program that such a core runs, and what its cycles went into.
 #[derive(Clone, Debug)]
 pub struct Pace {
@@ -106,47 +154,7 @@ impl Processor for Paced {
         unsafe { self.inner.map(start, length, host, writable) }
     }
 
-    delegate! {
-        to self.inner {
-            fn ask(&mut self, queued: Queued);
-            fn maps(&self, start: u64, length: u64) -> bool;
-            fn page_size(&self) -> u64;
-            fn boot(&mut self, table: u64, read: &dyn Fn(u64, Width) -> Option<u64>);
-            fn reset(&mut self);
-            fn take_reset_request(&mut self) -> bool;
-            fn next_event(&self) -> Option<VirtualNanos>;
-            fn on_event(&mut self, now: VirtualNanos);
-            fn waiting(&self) -> bool;
-            fn pc(&self) -> u64;
-            fn add_breakpoint(&mut self, address: u64) -> bool;
-            fn remove_breakpoint(&mut self, address: u64);
-            fn pass_breakpoint(&mut self, address: u64);
-            fn attach_debugger(&mut self, attached: bool);
-            fn hold_interrupts(&mut self, held: bool);
-            fn gdb_register(&self, number: usize) -> Option<Vec<u8>>;
-            fn set_gdb_register(&mut self, number: usize, bytes: &[u8]) -> bool;
-            fn debugger_access(
-                &mut self,
-                write: Option<u64>,
-                address: u64,
-                width: Width,
-                now: VirtualNanos,
-            ) -> Option<u64>;
-            fn take_debugger_trace(&mut self) -> Vec<u8>;
-            fn target_xml(&self) -> &'static str;
-            fn data_model(&self) -> DataModel;
-            fn byte_order(&self, address: u64) -> Endian;
-            fn save(&self) -> Vec<u8>;
-            fn monitor_command(&mut self, command: &str) -> Option<String>;
-            fn debugger_halted(&mut self, why: HaltReason) -> bool;
-            fn bit_alias(&self, address: u64, width: Width) -> Option<BitAlias>;
-            fn own_ranges(&self) -> Vec<std::ops::Range<u64>>;
-            fn check_reads(&mut self, every: bool);
-            fn check_words(&mut self, words: &[u64]);
-            fn host_call(&self, read: &mut dyn FnMut(u64, Width) -> Option<u64>) -> Option<HostCall>;
-            fn answer_host_call(&mut self, answer: Option<u64>);
-        }
-    }
+    pass_on!();
 }
 
 /// The bus, on which the inner core's instructions are so many cycles behind. It goes back to the runner after each access.

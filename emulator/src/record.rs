@@ -19,6 +19,8 @@ pub enum Event {
     Resumed,
     /// A kept map was taken up that a reset had left half done.
     Recovered,
+    /// The firmware forgot its map and began a new one.
+    Forgotten,
     /// A scan was taken in.
     Scan {
         /// Its middle beam on the firmware's clock.
@@ -116,6 +118,7 @@ impl Recorder {
         let event = match kind {
             1 => Event::Resumed,
             4 => Event::Recovered,
+            5 => Event::Forgotten,
             2 => {
                 let (from, len) = (u64::from(word(host, 0)?), u64::from(word(host, 1)?));
                 let mut ranges_mm = Vec::new();

@@ -266,6 +266,7 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
         }
         match &entry.event {
             Event::Resumed | Event::Recovered => {}
+            Event::Forgotten => *mapper = Mapper::new(robot.config(), drive)?,
             Event::Scan { middle_us, ranges_mm, .. } => drop(mapper.scan(*middle_us, ranges_mm)),
             Event::Coasted { until_us } => drop(mapper.coast(*until_us)),
         }

@@ -8,14 +8,18 @@ use anyhow::{Context, anyhow};
 use lineslam::robot::Robot;
 use lineslam::sim::SimConfig;
 use lineslam::sim::world::World;
+use rand_core::SeedableRng;
+use rand_pcg::Pcg64;
 use rigless::emulator::{self, AccessKind, Driver, Host, Settled, Start, Stop};
 use rigless::image::Image;
 use rigless::session::Session;
 use rigless::time::VirtualNanos;
 
 use crate::board::{
-    CYCLES_PER_INSTRUCTION, FLASH_ACCELERATED, FLASH_ACR, Nucleo, Shared, TIME_DRIVER_EGR, URG_BRR,
+    CYCLES_PER_INSTRUCTION, DBGMCU_APB1_FZ, EXTI_IMR, FLASH_ACCELERATED, FLASH_ACR, Nucleo, RCC_CR, Shared,
+    TIME_DRIVER_EGR, URG_BRR,
 };
+use crate::board_fault::{Around, BoardFault};
 use crate::cycles::{Cause, Program};
 use crate::fault::Fault;
 use crate::firmware::{Log, LogLine, Symbols};
@@ -96,6 +100,8 @@ pub struct Outcome {
     pub led_changes: u32,
     /// Whether the flash's accelerator was on at the end.
     pub flash_accelerated: bool,
+    /// The debug unit's bits for timers and watchdogs that stand while a debugger holds the core.
+    pub frozen: u64,
     /// Bytes of the firmware's variables.
     pub static_bytes: u64,
     /// Instructions executed.
@@ -140,6 +146,11 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         led: false,
         led_changes: 0,
         flash_accelerated: false,
+        frozen: 0,
+        board_faults: plan.faults.iter().filter_map(Fault::of_board).collect(),
+        order: symbols.order,
+        rng: Pcg64::seed_from_u64(plan.seed),
+        edges_seen: 0,
         see: Box::new(see),
         failure: None,
     };
@@ -169,6 +180,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         resets,
         led_changes: director.led_changes,
         flash_accelerated: director.flash_accelerated,
+        frozen: director.frozen,
         static_bytes: symbols.static_bytes,
         instructions: pace.as_ref().map_or(stop.instruction_count, |p| p.tally.of(Cause::Instructions)),
         cycles_per_instruction: pace.map_or(CYCLES_PER_INSTRUCTION, |p| p.tally.cycles_per_instruction()),
@@ -194,6 +206,11 @@ struct Director {
     led: bool,
     led_changes: u32,
     flash_accelerated: bool,
+    frozen: u64,
+    board_faults: Vec<BoardFault>,
+    order: Option<u64>,
+    rng: Pcg64,
+    edges_seen: usize,
     see: Box<dyn FnMut(Seen) + Send>,
     failure: Option<anyhow::Error>,
 }
@@ -211,6 +228,11 @@ impl Driver<Nucleo> for Director {
                 if let Ok(mut room) = self.shared.lock() {
                     room.host_rate = rate;
                 }
+            }
+            RCC_CR => session.board_mut().hold_hse(access.virtual_time),
+            DBGMCU_APB1_FZ => self.frozen = access.value,
+            address if address == EXTI_IMR.0 => {
+                session.board_mut().pvd_armed = access.value & EXTI_IMR.1 != 0;
             }
             FLASH_ACR => self.flash_accelerated = access.value & FLASH_ACCELERATED == FLASH_ACCELERATED,
             _ => {}
@@ -271,7 +293,9 @@ impl Director {
     ) -> anyhow::Result<bool> {
         let now_us = stop.at.0 / 1000;
         let before = self.lines.len();
-        self.log.drain(host, &mut self.lines)?;
+        if !self.board_faults.iter().any(|fault| fault.hides_log(now_us)) {
+            self.log.drain(host, &mut self.lines)?;
+        }
         for line in self.lines.iter().skip(before) {
             (self.see)(Seen::Line(line.clone()));
         }
@@ -288,10 +312,16 @@ impl Director {
             self.tell(now_us)?;
         }
         let mut edges = Vec::new();
+        let levels = self.room(|room| room.building.encoder_levels())?;
         self.room(|room| {
             room.building.advance(now_us, &mut edges);
             while room.urg.next_us() + STALE_US < now_us && room.from_sensor(now_us).is_some() {}
         })?;
+        for fault in &self.board_faults {
+            fault.disturb(&mut edges, levels, &mut self.edges_seen);
+            let around = &mut Around { stop, shared: &self.shared, order: self.order, rng: &mut self.rng };
+            fault.at(now_us, GRID_US, session, host, around)?;
+        }
         self.edges.extend(edges);
         for fault in &self.faults {
             fault.at(now_us, GRID_US, session, &self.shared, stop, host)?;
