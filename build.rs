@@ -64,10 +64,16 @@ fn constants(path: &Path) -> String {
          /// Microseconds from a scan's middle beam to the time that its stamp says.\n\
          pub const SCAN_DELAY_US: i64 = {};\n\
          /// Bit rate to work at with the scanner, bit/s; `None` for the driver's default.\n\
-         pub const BAUD_RATE: Option<u32> = {:?};\n",
+         pub const BAUD_RATE: Option<u32> = {:?};\n\
+         /// Pull resistors on the encoders' lines: up 1, down -1, none 0.\n\
+         pub const ENCODER_PULL: i8 = {};\n\
+         /// Pulses on the encoders' lines that are shorter do not count, nanoseconds.\n\
+         pub const ENCODER_FILTER_NS: u32 = {};\n",
         robot.name,
         (robot.sensor.scan_delay_s * 1e6).round() as i64,
         robot.sensor.baud_rate,
+        robot.encoders.pull as i8,
+        (robot.encoders.filter_us * 1e3).round() as u32,
     ) + &format!(
         "/// Puts sensor, mounting and odometry into a configuration.\n\
          pub fn apply(config: &mut slam_core::SlamConfig) {{\n\

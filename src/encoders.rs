@@ -10,6 +10,7 @@ use slam_core::odometry::ticks_between_u16;
 
 use crate::board::EncoderPins;
 use crate::kept::KeptTicks;
+use crate::liveness::{self, Task};
 
 /// Samples a second.
 pub const HZ: u64 = 200;
@@ -28,6 +29,7 @@ pub async fn run(pins: EncoderPins, mut kept: KeptTicks) {
     let mut totals = kept.read();
     let mut ticker = Ticker::every(Duration::from_hz(HZ));
     loop {
+        liveness::here(Task::Encoders).await;
         let now = encoders.counts();
         let stamp_us = Instant::now().as_micros();
         for ((total, before), now) in totals.iter_mut().zip(before).zip(now) {

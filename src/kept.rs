@@ -2,8 +2,8 @@
 //!
 //! The map is valid where its seal says so: a magic word, the checksum of this firmware's own code and constants (another firmware
 //! lays memory out differently), and the checksum of the map itself. While it is worked on it is open, with the seal of
-//! its last state; a reset in that time leaves it half done, and it is put in order. Power-up leaves noise, which no
-//! checksum fits.
+//! its last state; a reset in that time leaves it half done, and it is put in order. RAM that had no power is not believed,
+//! whatever its seal says: an open map has no checksum, and half-decayed RAM may have kept the seal and lost the rest.
 
 use core::mem::MaybeUninit;
 use core::ptr::{addr_of, addr_of_mut};
@@ -43,6 +43,17 @@ pub enum Found {
     HalfDone,
     /// Its checksum is wrong.
     Damaged,
+    /// Power was away: whatever the checksum says, RAM that had none is not believed.
+    PowerWasAway,
+    /// The firmware failed early with it too often, running.
+    GivenUp,
+}
+
+impl Found {
+    /// Whether there is a map to go on with.
+    pub fn is_map(self) -> bool {
+        matches!(self, Self::Map | Self::HalfDone)
+    }
 }
 
 #[repr(C)]
@@ -69,8 +80,9 @@ pub struct Keeper {
 }
 
 impl Keeper {
-    /// Takes the map that the last run left, or begins a new one. To be called once.
-    pub fn take() -> Result<(Self, Found), ConfigError> {
+    /// Takes the map that the last run left, or begins a new one, as it does where `refused` says why it is not to be had. To be
+    /// called once.
+    pub fn take(refused: Option<Found>) -> Result<(Self, Found), ConfigError> {
         let firmware = firmware_checksum();
         let store = addr_of_mut!(STORE);
         // SAFETY: called once, before any task runs, so nothing else refers to the store. A seal is four numbers, of
@@ -79,7 +91,9 @@ impl Keeper {
         unsafe {
             let seal = (*store).seal.assume_init_mut();
             let mapper = addr_of_mut!((*store).mapper);
-            let found = if seal.magic != MAGIC || seal.firmware != firmware {
+            let found = if let Some(why) = refused {
+                why
+            } else if seal.magic != MAGIC || seal.firmware != firmware {
                 Found::Nothing
             } else if seal.open == OPEN {
                 Found::HalfDone
@@ -94,7 +108,7 @@ impl Keeper {
                 Found::HalfDone if !(*mapper).assume_init_mut().recover() => Found::Damaged,
                 other => other,
             };
-            if !matches!(found, Found::Map | Found::HalfDone) {
+            if !found.is_map() {
                 *seal = Seal { magic: 0, firmware, open: OPEN, checksum: 0 };
                 Mapper::new_in(&mut *mapper, robot::config(), robot::DRIVE)?;
             }
@@ -107,6 +121,19 @@ impl Keeper {
     /// The map, to look at.
     pub fn mapper(&self) -> &Mapper {
         self.mapper
+    }
+
+    /// Begins a new map in place of the one that is kept.
+    pub fn forget(&mut self) -> Result<(), ConfigError> {
+        self.seal.open = OPEN;
+        self.seal.magic = 0;
+        compiler_fence(Ordering::SeqCst);
+        // SAFETY: the mapper's own place, which nothing else refers to. Nothing is to be dropped in it, and where the
+        // configuration is refused, which it was not at the start, it stays as it is.
+        let place = unsafe { &mut *core::ptr::from_mut(&mut *self.mapper).cast::<MaybeUninit<Mapper>>() };
+        Mapper::new_in(place, robot::config(), robot::DRIVE)?;
+        self.update(|_| ());
+        Ok(())
     }
 
     /// Works on the map and seals it again.

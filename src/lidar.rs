@@ -79,6 +79,7 @@ pub async fn run(pins: LidarPins, mut scans: Sender<'static, CriticalSectionRawM
             let mut call = core::pin::pin!(client.next_scan(&mut buffer.ranges_mm));
             let mut ticker = Ticker::every(ABSENCE);
             loop {
+                crate::liveness::here(crate::liveness::Task::Lidar).await;
                 match select(call.as_mut(), ticker.next()).await {
                     Either::First(outcome) => break outcome,
                     Either::Second(()) if STATE.present.load(Ordering::Relaxed) => {}

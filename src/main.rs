@@ -17,9 +17,19 @@ mod kept;
 #[cfg(target_os = "none")]
 mod lidar;
 #[cfg(target_os = "none")]
+mod liveness;
+#[cfg(target_os = "none")]
 mod mapping;
 #[cfg(target_os = "none")]
+mod measure;
+#[cfg(all(target_os = "none", feature = "misbehaves"))]
+mod orders;
+#[cfg(target_os = "none")]
+mod resets;
+#[cfg(target_os = "none")]
 mod robot;
+#[cfg(target_os = "none")]
+mod rtt;
 #[cfg(target_os = "none")]
 mod signs;
 #[cfg(target_os = "none")]

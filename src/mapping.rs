@@ -1,12 +1,10 @@
-//! The map: takes in scans and wheel ticks in thread mode, says what it knows, and feeds the watchdog.
+//! The map: takes in scans and wheel ticks in thread mode, and says what it knows.
 //!
 //! Everything urgent runs above this in interrupts: a long update delays no byte and no tick.
 
 use core::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use embassy_futures::select::{Either, select};
-use embassy_stm32::peripherals::IWDG;
-use embassy_stm32::wdg::IndependentWatchdog;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Receiver;
 use embassy_time::{Duration, Instant, Ticker};
@@ -15,15 +13,17 @@ use slam_core::geometry::pose::components;
 use slam_core::odometry::wheel_faults::WheelFault;
 use slam_core::tracking::TrackingState;
 
+use crate::board::{CORE_HZ, supply};
 use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;
 use crate::kept::{Found, Keeper, Mapper};
 use crate::lidar::{STATE, ScanBuffer};
-use crate::stack;
+use crate::liveness::{self, Task};
+use crate::measure::{self, ScanCycles};
+use crate::resets::Count;
 use crate::trace::{Event, Tracer, sigma};
+use crate::{rtt, stack};
 
-/// Unfed for so long, the watchdog resets the board. Its clock may run half as fast again as it should.
-pub const WATCHDOG_US: u32 = 3_000_000;
 /// Without a scan the map moves on by odometry so often …
 const COAST_EVERY: Duration = Duration::from_millis(50);
 /// … to so long ago: the longest that a scan may be on its way, its bytes at 115 200 bit/s included.
@@ -37,6 +37,8 @@ const PRINT_AT_ONCE: usize = 8;
 pub static TRACKING: AtomicU8 = AtomicU8::new(TrackingState::Tracking as u8);
 /// Set to have the map printed.
 pub static PRINT_MAP: AtomicBool = AtomicBool::new(false);
+/// Set to have the map forgotten.
+pub static FORGET_MAP: AtomicBool = AtomicBool::new(false);
 
 /// Maps for ever.
 #[embassy_executor::task]
@@ -45,37 +47,30 @@ pub async fn run(
     found: Found,
     tracer: Tracer,
     mut scans: Receiver<'static, CriticalSectionRawMutex, ScanBuffer>,
-    mut watchdog: IndependentWatchdog<'static, IWDG>,
 ) {
     let mut mapping = Mapping::new(keeper, tracer);
-    if matches!(found, Found::Map | Found::HalfDone) {
+    if found.is_map() {
         mapping.resume(found);
     }
     let mut ticker = Ticker::every(COAST_EVERY);
-    let mut absences = STATE.absences.load(Ordering::Relaxed);
     loop {
+        liveness::here(Task::Mapping).await;
         match select(scans.receive(), ticker.next()).await {
             Either::First(scan) => {
-                mapping.take_scan(scan);
+                if mapping.may_work() {
+                    mapping.take_scan(scan);
+                }
                 scans.receive_done();
-                watchdog.pet();
             }
-            Either::Second(()) => mapping.coast(),
-        }
-        // The lidar task lives and says that there is no sensor.
-        let reported = STATE.absences.load(Ordering::Relaxed);
-        if core::mem::replace(&mut absences, reported) != reported {
-            watchdog.pet();
+            Either::Second(()) => {
+                if mapping.may_work() {
+                    mapping.coast();
+                }
+            }
         }
         mapping.report();
+        mapping.forget_map();
         mapping.print_map();
-        #[cfg(feature = "hang")]
-        if Instant::now().as_secs() >= 20 {
-            defmt::error!("hanging, as this build is told to");
-            loop {
-                cortex_m::asm::nop();
-            }
-        }
     }
 }
 
@@ -85,9 +80,11 @@ struct Mapping {
     next_status: Instant,
     scans_at_status: u32,
     last_took_us: u32,
+    scan_cycles: ScanCycles,
     busy_us: u64,
     printing: Option<usize>,
     coasting: bool,
+    supply_is_low: bool,
     dropped: u32,
     /// As they were said last.
     state: TrackingState,
@@ -103,9 +100,11 @@ impl Mapping {
             next_status: Instant::now() + STATUS_EVERY,
             scans_at_status: 0,
             last_took_us: 0,
+            scan_cycles: ScanCycles::default(),
             busy_us: 0,
             printing: None,
             coasting: false,
+            supply_is_low: false,
             dropped: 0,
             state: TrackingState::Tracking,
             fault: None,
@@ -133,14 +132,28 @@ impl Mapping {
         );
     }
 
+    /// Whether the map may be worked on: not while the supply falls, when every instruction may be the last.
+    fn may_work(&mut self) -> bool {
+        let low = supply::is_low();
+        if core::mem::replace(&mut self.supply_is_low, low) != low {
+            if low {
+                defmt::warn!("the supply is low; the map is left as it is");
+            } else {
+                defmt::info!("the supply is well again");
+            }
+        }
+        !low
+    }
+
     fn take_scan(&mut self, scan: &ScanBuffer) {
-        let begin = Instant::now();
+        let (begin, begin_cycles) = (Instant::now(), measure::cycles());
         let Self { keeper, tracer, .. } = self;
         let ranges_mm = scan.ranges_mm.get(..scan.len).unwrap_or(&[]);
         let update = keeper.update(|mapper| {
             take_samples(mapper, tracer);
             mapper.scan(scan.middle_us, ranges_mm)
         });
+        self.scan_cycles.add(measure::cycles().wrapping_sub(begin_cycles));
         let took_us = begin.elapsed().as_micros() as u32;
         self.last_took_us = took_us;
         self.busy_us += u64::from(took_us);
@@ -262,12 +275,41 @@ impl Mapping {
             slam.counters(),
             mapper.counters()
         );
+        let [median, most] = self.scan_cycles.take();
+        let urgent_permille =
+            u64::from(measure::take_urgent()) * 1_000_000_000 / u64::from(CORE_HZ) / period_us.max(1);
+        defmt::info!(
+            "health: scan {=u32} cycles at the median, {=u32} at most; urgent executor {=u64} permille; supply dips {=u32}; \
+             log frames lost {=u32}; since power-up: watchdog {=u32}, failures {=u32}, clock lost {=u32}",
+            median,
+            most,
+            urgent_permille,
+            supply::dips(),
+            rtt::lost(),
+            Count::Watchdog.read(),
+            Count::Failure.read(),
+            Count::ClockLost.read()
+        );
         defmt::info!(
             "stack: {=u32} bytes at most, {=u32} in thread mode, {=u32} in the urgent executor",
             stack::most(),
             stack::most_in_thread(),
             stack::most_in_interrupts()
         );
+    }
+
+    /// Begins a new map where the button asks for it.
+    fn forget_map(&mut self) {
+        if !FORGET_MAP.load(Ordering::Relaxed) || !self.may_work() {
+            return;
+        }
+        FORGET_MAP.store(false, Ordering::Relaxed);
+        self.printing = None;
+        match self.keeper.forget() {
+            Ok(()) => defmt::warn!("the map is forgotten, as the button asks; a new one begins"),
+            Err(error) => defmt::error!("the configuration cannot be used: {}", error),
+        }
+        self.tracer.event(Event::Forgotten, 0, &[], self.keeper.mapper(), 0);
     }
 
     /// A few segments of the map that was asked for, so that the log keeps up.

@@ -23,6 +23,8 @@ pub enum Event {
     Coasted = 3,
     /// The firmware took up a kept map that a reset had left half done; what came before is not to be had.
     Recovered = 4,
+    /// The firmware forgot its map and began a new one.
+    Forgotten = 5,
 }
 
 /// The record. Every field is of four or eight bytes, little-endian, without padding between them.

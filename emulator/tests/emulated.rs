@@ -146,16 +146,6 @@ fn a_reset_by_pin_while_driving_keeps_map_and_pose() {
 }
 
 #[test]
-fn a_firmware_that_hangs_is_reset_by_the_watchdog_and_keeps_its_map() {
-    let (outcome, judged) = run_in("hang", Some(40), &[]);
-    assert_eq!(outcome.resets.len(), 1, "{:?}", outcome.resets);
-    assert!(says(&outcome, "ERROR", "hanging, as this build is told to"));
-    assert!(says(&outcome, "INFO", "reset by Watchdog"));
-    assert!(says(&outcome, "INFO", "is kept"));
-    assert!(last_error_m(&judged) < 0.20, "{}", last_error_m(&judged));
-}
-
-#[test]
 fn stamps_of_the_sensor_wrap_without_notice() {
     let (outcome, judged) = hall(Some(40), &["stamp-wrap"]);
     assert!(nothing_lost(&outcome));

@@ -13,11 +13,17 @@ use embassy_stm32::gpio::{Input, Level, Output, Pull, Speed};
 use embassy_stm32::interrupt;
 use embassy_stm32::interrupt::{InterruptExt, Priority};
 use embassy_stm32::mode::Async;
-use embassy_stm32::timer::qei::Qei;
 use embassy_stm32::usart::{self, RingBufferedUartRx, Uart, UartTx};
 use embassy_stm32::wdg::IndependentWatchdog;
-use embassy_stm32::{Config, Peri, bind_interrupts, dma, pac, peripherals, rcc, time};
+use embassy_stm32::{Peri, bind_interrupts, dma, pac, peripherals};
 use static_cell::StaticCell;
+
+mod clocks;
+mod encoders;
+pub mod supply;
+
+pub use clocks::{CORE_HZ, ClockSource};
+pub use encoders::EncoderPins;
 
 /// For the boot banner.
 pub const NAME: &str = "NUCLEO-F429ZI";
@@ -28,7 +34,7 @@ static URGENT: InterruptExecutor = InterruptExecutor::new();
 #[interrupt]
 unsafe fn UART5() {
     // SAFETY: this is the executor's interrupt, and only it calls this.
-    crate::stack::watched(|| unsafe { URGENT.on_interrupt() })
+    crate::measure::urgent(|| crate::stack::watched(|| unsafe { URGENT.on_interrupt() }))
 }
 
 /// Starts the executor of what must not wait for the map. To be called once.
@@ -59,9 +65,10 @@ pub struct Board {
     pub led: Output<'static>,
     /// High while pressed.
     pub button: Input<'static>,
-    /// Resets the board unless it is fed.
-    pub watchdog: IndependentWatchdog<'static, peripherals::IWDG>,
 }
+
+/// Resets the board unless it is fed.
+pub type Watchdog = IndependentWatchdog<'static, peripherals::IWDG>;
 
 /// Pins and DMA channels of the scanner's port.
 pub struct LidarPins {
@@ -70,16 +77,6 @@ pub struct LidarPins {
     tx: Peri<'static, peripherals::PG14>,
     rx_dma: Peri<'static, peripherals::DMA2_CH1>,
     tx_dma: Peri<'static, peripherals::DMA2_CH6>,
-}
-
-/// Pins and timers of the encoders.
-pub struct EncoderPins {
-    left: Peri<'static, peripherals::TIM4>,
-    left_a: Peri<'static, peripherals::PD12>,
-    left_b: Peri<'static, peripherals::PD13>,
-    right: Peri<'static, peripherals::TIM3>,
-    right_a: Peri<'static, peripherals::PC6>,
-    right_b: Peri<'static, peripherals::PC7>,
 }
 
 /// Pin and DMA channel of the virtual COM port.
@@ -104,11 +101,33 @@ pub enum ResetCause {
     Other,
 }
 
-/// Clocks, pins, interrupts. To be called once, first.
-pub fn start() -> (Board, ResetCause) {
-    let cause = reset_cause();
-    let p = embassy_stm32::init(clocks());
+/// Starts the watchdog, which runs on an oscillator of its own, and stops it and the timers while a debugger holds the core. To be
+/// called once, before anything that could hang.
+pub fn guard(unfed_us: u32) -> Watchdog {
+    pac::DBGMCU.apb1fzr().modify(|w| {
+        w.set_iwdg(true);
+        w.set_wwdg(true);
+        w.set_tim2(true);
+        w.set_tim3(true);
+        w.set_tim4(true);
+    });
+    // SAFETY: the HAL hands out its peripherals when it starts, which is later; the one of the watchdog is left there.
+    let mut watchdog = IndependentWatchdog::new(unsafe { peripherals::IWDG::steal() }, unfed_us);
+    watchdog.unleash();
+    if let Some(mut core) = cortex_m::Peripherals::take() {
+        core.DCB.enable_trace();
+        core.DWT.enable_cycle_counter();
+    }
+    watchdog
+}
+
+/// Clocks, pins, interrupts. To be called once. `external_clock` says whether the ST-LINK's clock may be taken.
+pub fn start(external_clock: bool) -> (Board, ClockSource) {
+    let clock = ClockSource::choose(external_clock);
+    let p = embassy_stm32::init(clock.config());
+    clock.guard();
     accelerate_flash();
+    supply::watch();
     // The firmware's own urgent work comes after what the hardware cannot hold back, bytes and time.
     interrupt::UART5.set_priority(Priority::P6);
     let board = Board {
@@ -125,29 +144,8 @@ pub fn start() -> (Board, ResetCause) {
         led: Output::new(p.PB0, Level::Low, Speed::Low),
         // The board has a pull-down resistor.
         button: Input::new(p.PC13, Pull::None),
-        watchdog: IndependentWatchdog::new(p.IWDG, crate::mapping::WATCHDOG_US),
     };
-    (board, cause)
-}
-
-/// 180 MHz from the 8 MHz that the ST-LINK gives.
-fn clocks() -> Config {
-    use rcc::{AHBPrescaler, APBPrescaler, Hse, HseMode, Pll, PllMul, PllPDiv, PllPreDiv, PllSource, Sysclk};
-    let mut config = Config::default();
-    config.rcc.hse = Some(Hse { freq: time::Hertz(8_000_000), mode: HseMode::Bypass });
-    config.rcc.pll_src = PllSource::HSE;
-    config.rcc.pll = Some(Pll {
-        prediv: PllPreDiv::DIV4,
-        mul: PllMul::MUL180,
-        divp: Some(PllPDiv::DIV2),
-        divq: None,
-        divr: None,
-    });
-    config.rcc.sys = Sysclk::PLL1_P;
-    config.rcc.ahb_pre = AHBPrescaler::DIV1;
-    config.rcc.apb1_pre = APBPrescaler::DIV4;
-    config.rcc.apb2_pre = APBPrescaler::DIV2;
-    config
+    (board, clock)
 }
 
 /// Has code and constants read ahead and kept: at 180 MHz the flash makes the core wait five cycles for each 16 bytes that it
@@ -161,7 +159,7 @@ fn accelerate_flash() {
 }
 
 /// Reads the reset flags and clears them for the next time. A power-up sets the pin's flag too.
-fn reset_cause() -> ResetCause {
+pub fn reset_cause() -> ResetCause {
     let flags = pac::RCC.csr().read();
     pac::RCC.csr().modify(|w| w.set_rmvf(true));
     if flags.porrstf() || flags.borrstf() {
@@ -228,32 +226,15 @@ impl scip::SerialPort for LidarPort {
     }
 }
 
-/// Both encoders, counted by timers.
-pub struct Encoders {
-    left: Qei<'static, peripherals::TIM4>,
-    right: Qei<'static, peripherals::TIM3>,
-}
-
-impl EncoderPins {
-    /// Starts counting, from zero.
-    pub fn start(self) -> Encoders {
-        Encoders {
-            left: Qei::new(self.left, self.left_a, self.left_b, Default::default()),
-            right: Qei::new(self.right, self.right_a, self.right_b, Default::default()),
-        }
-    }
-}
-
-impl Encoders {
-    /// Counters of the left and right wheel, which wrap.
-    pub fn counts(&self) -> [u16; 2] {
-        [self.left.count(), self.right.count()]
-    }
-}
-
 impl ConsolePins {
     /// Opens the port at 115 200 bit/s. `None` if that cannot be made, which it can.
     pub fn open(self) -> Option<UartTx<'static, Async>> {
         UartTx::new(self.usart, self.tx, self.tx_dma, Irqs, usart::Config::default()).ok()
     }
+}
+
+/// For tests: what the console's port has sent is never told, as if an interrupt were lost.
+#[cfg(feature = "misbehaves")]
+pub fn silence_console() {
+    interrupt::DMA1_STREAM3.disable();
 }

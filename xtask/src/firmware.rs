@@ -8,7 +8,7 @@ use crate::TARGET;
 use crate::run::{cargo, ensure_target, is_installed, program, step, target_folder};
 
 /// What probe-rs calls the default board's chip.
-const CHIP: &str = "STM32F429ZITx";
+pub const CHIP: &str = "STM32F429ZITx";
 /// What to build for the emulator, and how. The emulated part asks for a newer compiler than it needs.
 pub const EMULATOR: &str = "--profile emulator -p emulator --ignore-rust-version";
 /// Where finished ELF files are put, under the target folder.
@@ -21,8 +21,8 @@ pub enum Build {
     Flashed,
     /// The same for parts with 128 KiB of RAM.
     Small,
-    /// Stops processing after a while, for the test of the watchdog.
-    Hanging,
+    /// Hangs, panics or faults when it is told to, for the tests of watchdog and last words.
+    Misbehaving,
     /// Sleeps a thousand times, says how late it woke and panics, for the tests of the emulated time driver and of last words.
     Sleeping,
 }
@@ -32,7 +32,7 @@ impl Build {
         match self {
             Self::Flashed => "lineslam",
             Self::Small => "small",
-            Self::Hanging => "hang",
+            Self::Misbehaving => "misbehaves",
             Self::Sleeping => "sleeps",
         }
     }
@@ -41,7 +41,7 @@ impl Build {
         match self {
             Self::Flashed => "",
             Self::Small => "--features small",
-            Self::Hanging => "--features hang",
+            Self::Misbehaving => "--features misbehaves",
             Self::Sleeping => "--features sleeps",
         }
     }
@@ -135,7 +135,7 @@ fn build_emulator() -> anyhow::Result<()> {
 /// Builds what the tests of the emulated board need, and says where it is.
 pub fn for_tests() -> anyhow::Result<[(&'static str, PathBuf); 3]> {
     Ok([
-        ("LINESLAM_FIRMWARE_HANG", build(Build::Hanging)?),
+        ("LINESLAM_FIRMWARE_MISBEHAVES", build(Build::Misbehaving)?),
         ("LINESLAM_FIRMWARE_SLEEPS", build(Build::Sleeping)?),
         // Last, so that it is the one that lies where cargo puts it.
         ("LINESLAM_FIRMWARE", build(Build::Flashed)?),

@@ -26,7 +26,7 @@ pub fn everything() -> anyhow::Result<()> {
         // As it is built: it makes its scans with the whole command, which is not to be built twice.
         "--release -p bench-target",
         "-p firmware",
-        "-p firmware --features hang,sleeps",
+        "-p firmware --features misbehaves,sleeps",
     ] {
         let command = format!("clippy {arguments} --target {TARGET} -- -D warnings");
         step(&format!("clippy for {TARGET}: {arguments}"), &mut cargo(&command))?;
