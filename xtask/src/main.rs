@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 mod bench;
+mod board_setup;
 mod firmware;
 mod performance;
 mod run;
@@ -44,6 +45,8 @@ enum Task {
     Flash,
     /// Show the log of the firmware that runs, with probe-rs.
     Attach,
+    /// Set the board's option bytes with probe-rs, once: brown-out reset at level 3.
+    BoardSetup,
     /// Flash and RAM of the firmware by section and crate, against the budget, and of the sensor's driver alone.
     Size,
     /// Instructions that decoding a scan takes, counted by callgrind.
@@ -71,6 +74,7 @@ fn main() -> ExitCode {
         Task::Firmware => firmware::build(Build::Flashed).map(|elf| println!("{}", elf.display())),
         Task::Flash => firmware::flash(),
         Task::Attach => firmware::attach(),
+        Task::BoardSetup => board_setup::run(),
         Task::Size => size::report(),
         Task::Bench => bench::report(),
         Task::BenchTarget => firmware::bench(),
