@@ -17,7 +17,7 @@ use crate::board::{CORE_HZ, supply};
 use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;
 use crate::kept::{Found, Keeper, Mapper};
-use crate::lidar::{STATE, ScanBuffer};
+use crate::lidar::{self, STATE, ScanBuffer};
 use crate::liveness::{self, Task};
 use crate::measure::{self, ScanCycles};
 use crate::resets::Count;
@@ -26,7 +26,8 @@ use crate::{rtt, stack};
 
 /// Without a scan the map moves on by odometry so often …
 const COAST_EVERY: Duration = Duration::from_millis(50);
-/// … to so long ago: the longest that a scan may be on its way, its bytes at 115 200 bit/s included.
+/// … to so long ago: the longest that a scan may be on its way from its middle beam. That is 122 ms at 250 kbit/s and 222 ms at
+/// 115 200 bit/s, the least rate that the driver falls back to: 33 ms of sweep, 3 ms of the sensor's work, and its bytes.
 const COAST_BEHIND_US: u64 = 230_000;
 /// The status is logged so often.
 const STATUS_EVERY: Duration = Duration::from_secs(1);
@@ -151,6 +152,7 @@ impl Mapping {
         let ranges_mm = scan.ranges_mm.get(..scan.len).unwrap_or(&[]);
         let update = keeper.update(|mapper| {
             take_samples(mapper, tracer);
+            mapper.set_revolution_us(scan.revolution_us);
             mapper.scan(scan.middle_us, ranges_mm)
         });
         self.scan_cycles.add(measure::cycles().wrapping_sub(begin_cycles));
@@ -290,6 +292,7 @@ impl Mapping {
             Count::Failure.read(),
             Count::ClockLost.read()
         );
+        lidar::report();
         defmt::info!(
             "stack: {=u32} bytes at most, {=u32} in thread mode, {=u32} in the urgent executor",
             stack::most(),

@@ -9,7 +9,7 @@ use slam_core::geometry::pose::components;
 use crate::kept::{Mapper, SAMPLES};
 
 /// Changes with the layout.
-const LAYOUT: u32 = 2;
+const LAYOUT: u32 = 3;
 
 /// What was done to the map.
 #[repr(u32)]
@@ -52,6 +52,8 @@ pub struct Trace {
     took_us: u32,
     /// The [`TrackingState`](slam_core::tracking::TrackingState) after the event.
     state: u32,
+    /// One revolution of the scanner, microseconds.
+    revolution_us: u32,
 }
 
 #[unsafe(no_mangle)]
@@ -69,6 +71,7 @@ static mut TRACE: Trace = Trace {
     segments: 0,
     took_us: 0,
     state: 0,
+    revolution_us: 0,
 };
 
 /// The one writer of the record.
@@ -104,6 +107,7 @@ impl Tracer {
         t.segments = mapper.slam().map().segments().len() as u32;
         t.took_us = took_us;
         t.state = mapper.slam().state() as u32;
+        t.revolution_us = mapper.slam().config().sensor.geometry.revolution_us;
         // Last, and seen so by whoever reads memory.
         core::sync::atomic::compiler_fence(core::sync::atomic::Ordering::SeqCst);
         // SAFETY: a field of a record that this alone refers to.

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, ensure};
 use rigless::chip::Timeline;
-use rigless::chip::uart::Peer;
+use rigless::chip::uart::{Errors, Peer};
 use rigless::cpu::armv7m::windows;
 use rigless::device::{Device, Level};
 use rigless::machine::{Board, Crystal, Supply, Target, armv7m};
@@ -16,6 +16,7 @@ use rigless::soc::Error;
 use rigless::soc::stm32f427::Stm32f427;
 use rigless::soc::stm32f427::generated::rcc::{Register as Rcc, cir, cr};
 use rigless::soc::stm32f427::generated::tim2::Register as Tim2;
+use rigless::soc::stm32f427::generated::usart6::{Register as Usart, cr3};
 use rigless::soc::stm32f427::peripherals::gpio::Pin;
 use rigless::time::VirtualNanos;
 
@@ -154,6 +155,31 @@ impl Nucleo {
             let off = cr::HSEON.set(registers.get(Rcc::Cr), 0);
             registers.set(Rcc::Cr, off);
             rcc.write(Rcc::Cr, off, registers, context);
+        });
+    }
+
+    /// One byte in so many that arrive comes with noise, as the errors that this returns draw it.
+    pub fn set_noise(&mut self, one_in: u32, seed: u64) -> Errors {
+        let errors = self.mcu.usart[URG_PORT].errors_mut();
+        errors.seed = seed;
+        (errors.noise.name, errors.noise.per_million) = ("urg.noise", 1_000_000 / one_in.max(1));
+        *errors
+    }
+
+    /// Has the port sample each bit three times, whatever the firmware wants: noise raises its flag then, as noise on a start bit does
+    /// on the silicon with one sample for a bit too.
+    pub fn sample_three_times(&mut self) {
+        let (_, registers) = self.mcu.serial_port(URG_PORT);
+        let value = registers.get(Usart::Cr3);
+        registers.set(Usart::Cr3, cr3::ONEBIT.set(value, 0));
+    }
+
+    /// Holds up the DMA that receives, or lets it go on.
+    pub fn hold_dma(&mut self, at: VirtualNanos, held: bool) {
+        self.mcu.drive_serial_port(at, URG_PORT, |port, registers, context| {
+            let value = cr3::DMAR.set(registers.get(Usart::Cr3), u64::from(!held));
+            registers.set(Usart::Cr3, value);
+            Device::write(port, Usart::Cr3, value, registers, context);
         });
     }
 

@@ -39,7 +39,8 @@ struct Cli {
     /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.jsonl, log.txt, console.tum and report.json.
     #[arg(long, value_name = "FOLDER", default_value = "out")]
     out: PathBuf,
-    /// What goes wrong: unplug@S+S, garble=N, line=N, streaming=BIT/S, reset@S, stamp-wrap, hse-dead, hse-dies@S, power@S=PERMILLE,
+    /// What goes wrong: unplug@S+S, garble=N, line=N, noise=N, start-noise=N, streaming=BIT/S, good-to=BIT/S, reset@S, dma-held@S+S,
+    /// held@S+S, clock@S=MS, skew=PPM, slow=PPM, quirk=NAME, stamp-wrap, hse-dead, hse-dies@S, power@S=PERMILLE,
     /// sag@S+S, probe-gone@S+S, hold@S+S, order@S=N, glitch=NS. May be given again.
     #[arg(long = "fault", value_name = "FAULT")]
     faults: Vec<Fault>,

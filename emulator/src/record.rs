@@ -8,7 +8,7 @@ use slam_core::geometry::pose::pose;
 use slam_core::tracking::TrackingState;
 
 /// The layout that is understood.
-const LAYOUT: u64 = 2;
+const LAYOUT: u64 = 3;
 /// Samples in the record's ring.
 const RING: u64 = 64;
 
@@ -29,6 +29,8 @@ pub enum Event {
         ranges_mm: Vec<u16>,
         /// What the work took.
         took_us: u32,
+        /// One revolution of the scanner, as the firmware measured it.
+        revolution_us: u32,
     },
     /// On by odometry alone.
     Coasted {
@@ -125,7 +127,8 @@ impl Recorder {
                 for k in 0..len {
                     ranges_mm.push(host.read(from + 2 * k, Width::W16)? as u16);
                 }
-                Event::Scan { middle_us: at_us, ranges_mm, took_us: word(host, 9)? }
+                let (took_us, revolution_us) = (word(host, 9)?, word(host, 11)?);
+                Event::Scan { middle_us: at_us, ranges_mm, took_us, revolution_us }
             }
             3 => Event::Coasted { until_us: at_us },
             other => anyhow::bail!("an event of kind {other}"),

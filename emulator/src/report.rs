@@ -95,7 +95,7 @@ pub fn judge(world: &World, seed: u64, outcome: &Outcome) -> anyhow::Result<Judg
     let mut sent = outcome.scans.iter();
     for (number, entry) in outcome.entries.iter().enumerate() {
         samples.extend(&entry.samples);
-        let Event::Scan { middle_us, ranges_mm, took_us } = &entry.event else { continue };
+        let Event::Scan { middle_us, ranges_mm, took_us, .. } = &entry.event else { continue };
         // They come in the order in which they were sent.
         let Some(truth) = sent.by_ref().find(|s| s.ranges_mm == *ranges_mm) else {
             anyhow::bail!("the firmware took in a scan at {middle_us} µs that the sensor never sent");
@@ -267,7 +267,10 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
         match &entry.event {
             Event::Resumed | Event::Recovered => {}
             Event::Forgotten => *mapper = Mapper::new(robot.config(), drive)?,
-            Event::Scan { middle_us, ranges_mm, .. } => drop(mapper.scan(*middle_us, ranges_mm)),
+            Event::Scan { middle_us, ranges_mm, revolution_us, .. } => {
+                mapper.set_revolution_us(*revolution_us);
+                let _ = mapper.scan(*middle_us, ranges_mm);
+            }
             Event::Coasted { until_us } => drop(mapper.coast(*until_us)),
         }
         let here = slam_core::geometry::pose::components(&mapper.slam().pose());

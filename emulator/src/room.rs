@@ -6,6 +6,7 @@ use lineslam::sim::scanner::{Moment, Scanner};
 use lineslam::sim::world::World;
 use lineslam::sim::{SimConfig, config, interpolate};
 use nalgebra::Isometry2;
+use rigless::chip::uart::Errors;
 use rigless::device::Level;
 use scip::sim::{Mode, SimulatedUrg, rates_agree};
 
@@ -41,8 +42,8 @@ pub struct Building {
     world: World,
     base: Base,
     scanner: Scanner,
-    beam_us: f64,
-    first_beam_us: f64,
+    first_step: f64,
+    steps_per_revolution: f64,
     /// Pose at each step so far, one ahead of now.
     poses: Vec<Isometry2<f64>>,
     ticks: [i64; 2],
@@ -68,15 +69,14 @@ impl Building {
             robot.wheels.ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
         wheels.counter_bits = 32;
         let geometry = robot.config().sensor.geometry;
-        let beam_us = f64::from(geometry.revolution_us) / f64::from(geometry.steps_per_revolution);
         // Counters begin again when the board is reset; the encoders' lines know nothing of that.
         let mut sim = *sim;
         sim.fault.restart_at_s = config::NEVER_S;
         let base = Base::new(&world.path, wheels, &sim, seed);
         Ok(Self {
             scanner: Scanner::new(&world, robot, &sim, seed),
-            beam_us,
-            first_beam_us: f64::from(geometry.first_step) * beam_us,
+            first_step: geometry.first_step.into(),
+            steps_per_revolution: geometry.steps_per_revolution.into(),
             path_m: path_length(&world),
             driven_m: 0.0,
             poses: vec![base.pose],
@@ -129,8 +129,10 @@ impl Building {
         self.ticks.map(levels)
     }
 
-    fn measure(&mut self, begin_us: u64, ranges_mm: &mut [u16]) {
-        let at = |beam: usize| begin_us as f64 + self.first_beam_us + beam as f64 * self.beam_us;
+    /// A scan whose revolution began at that instant and takes so long.
+    fn measure(&mut self, begin_us: u64, revolution_us: u64, ranges_mm: &mut [u16]) {
+        let beam_us = revolution_us as f64 / self.steps_per_revolution;
+        let at = |beam: usize| begin_us as f64 + (self.first_step + beam as f64) * beam_us;
         let middle_us = at(0).midpoint(at(ranges_mm.len() - 1));
         let people = self.world.people_at(middle_us * 1e-6);
         let poses = &self.poses;
@@ -168,19 +170,28 @@ pub struct Room {
     pub plugged: bool,
     /// What came over the virtual COM port.
     pub console: Vec<u8>,
+    /// Draws as the port's own model does which bytes come with noise, where that is not to change them.
+    pub flagged: Option<Errors>,
 }
 
 impl Room {
     /// The sensor powers up at the beginning.
     pub fn new(building: Building, seed: u64) -> Self {
-        Self { building, urg: SimulatedUrg::new(0, seed), host_rate: 0, plugged: true, console: Vec::new() }
+        Self {
+            building,
+            urg: SimulatedUrg::new(0, seed),
+            host_rate: 0,
+            plugged: true,
+            console: Vec::new(),
+            flagged: None,
+        }
     }
 
     /// The sensor has been on for long and streams, at another bit rate than the firmware wants.
     pub fn already_streaming(&mut self, baud_rate: u32, seed: u64) {
-        let faults = self.urg.faults;
+        let (faults, quirks) = (self.urg.faults, self.urg.quirks);
         self.urg = SimulatedUrg::found(0, seed, baud_rate, Mode::Streaming);
-        self.urg.faults = faults;
+        (self.urg.faults, self.urg.quirks) = (faults, quirks);
     }
 
     /// A byte from the microcontroller.
@@ -193,11 +204,14 @@ impl Room {
     /// The next byte that the sensor has sent by now. The port hears nothing where the bit rates differ.
     pub fn from_sensor(&mut self, now_us: u64) -> Option<u8> {
         let Self { building, urg, .. } = self;
-        urg.advance(now_us, &mut |begin_us, ranges_mm| building.measure(begin_us, ranges_mm));
+        let revolution_us = urg.revolution_us();
+        urg.advance(now_us, &mut |begin_us, ranges_mm| building.measure(begin_us, revolution_us, ranges_mm));
         loop {
             let sent = self.urg.transmit(now_us)?;
             if self.plugged && rates_agree(self.host_rate, sent.baud_rate) {
-                return Some(sent.byte);
+                // What the model of the port will flip is flipped beforehand, so that noise raises its flag on a byte that is right.
+                let flipped = self.flagged.as_mut().map_or(0, |errors| errors.next(u8::BITS).flipped);
+                return Some(sent.byte ^ flipped as u8);
             }
         }
     }

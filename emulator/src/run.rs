@@ -127,7 +127,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
     let pace = plan.cycles.then(|| Program::read(&elf, plan.elf).map(Pace::new)).transpose()?;
     let mut board = Nucleo::new(shared.clone(), pace.clone())?;
     for fault in &plan.faults {
-        fault.prepare_board(&mut board, plan.seed);
+        fault.prepare_board(&mut board, &shared, plan.seed);
     }
     let session = Session::new(Box::new(board), 0, VirtualNanos(GRID_US * 1000))?;
     let driver = Director {

@@ -3,5 +3,7 @@
 
 #[cfg(feature = "nucleo-f429zi")]
 mod nucleo_f429zi;
+mod receiver;
 #[cfg(feature = "nucleo-f429zi")]
 pub use nucleo_f429zi::*;
+pub use receiver::{LineErrors, line_errors};
