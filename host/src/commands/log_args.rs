@@ -1,6 +1,6 @@
 //! What every command that reads a log takes.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use lineslam::log::{self, Format, Log, RangeUnit, ReadOptions, Scanner, StampUnit, Warning};
@@ -12,6 +12,13 @@ use super::common::terminal;
 pub struct LogArgs {
     /// The log: a ROS bag (.bag, .mcap, .db3 or its folder), a CARMEN or mines log or JSON lines, these plain or gzipped.
     pub log: PathBuf,
+    #[command(flatten)]
+    reading: ReadArgs,
+}
+
+/// How it is read.
+#[derive(clap::Args)]
+pub struct ReadArgs {
     /// Format of the log.
     #[arg(long, value_enum, default_value_t = Format::Auto)]
     format: Format,
@@ -38,6 +45,13 @@ pub struct LogArgs {
 impl LogArgs {
     /// Reads the log. `wheels` prefers how far wheels turned to poses, where a bag has both.
     pub fn read(&self, robot: Option<&Robot>, wheels: bool) -> Result<Log, log::LogError> {
+        self.reading.read(&self.log, robot, wheels)
+    }
+}
+
+impl ReadArgs {
+    /// The same of a log that is named elsewhere.
+    pub fn read(&self, path: &Path, robot: Option<&Robot>, wheels: bool) -> Result<Log, log::LogError> {
         let style = ProgressStyle::with_template(
             "{bar:40.cyan/dim} {bytes}/{total_bytes} read  {bytes_per_sec}  {eta} left",
         )
@@ -59,7 +73,7 @@ impl LogArgs {
             wheels,
             progress: &progress,
         };
-        let log = log::read(&self.log, &options)?;
+        let log = log::read(path, &options)?;
         bar.finish_and_clear();
         Ok(log)
     }

@@ -4,6 +4,7 @@ pub mod benchmark;
 pub mod calibrate;
 pub mod common;
 pub mod experiments;
+pub mod live;
 pub mod log_args;
 pub mod replay;
 pub mod scan;

@@ -1,0 +1,155 @@
+//! `lineslam live`.
+
+use std::net::{IpAddr, SocketAddr};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use lineslam::live::log_source::LogSource;
+use lineslam::live::server::{Options, PORT, Server};
+use lineslam::map_file::{MapFile, MapFileError};
+use lineslam::replay::Start;
+use lineslam::robot::Robot;
+use lineslam::sim::world::World;
+use lineslam::sim::{self, SimConfig, judge};
+
+use super::common::Configuration;
+use super::log_args::{ReadArgs, warn};
+
+#[derive(clap::Args)]
+#[command(group(clap::ArgGroup::new("source").required(true).args(["log", "simulate"])))]
+pub struct Args {
+    /// The log: a ROS bag (.bag, .mcap, .db3 or its folder), a CARMEN or mines log or JSON lines, these plain or gzipped.
+    log: Option<PathBuf>,
+    #[command(flatten)]
+    reading: ReadArgs,
+    /// Instead of a log: drive a simulated robot through this world, whose true walls are shown beneath the map.
+    #[arg(long, value_name = "WORLD")]
+    simulate: Option<PathBuf>,
+    /// Seed of the simulated drive.
+    #[arg(long, default_value_t = 1, requires = "simulate")]
+    seed: u64,
+    /// Change an error of the simulated robot, or have something happen to it; `lineslam simulate --help` has all keys.
+    #[arg(long = "set", value_name = "KEY=VALUE", requires = "simulate")]
+    settings: Vec<String>,
+    /// Robot file, as for replay and simulate.
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Which algorithm.
+    #[arg(long, value_enum, default_value_t = Configuration::Default)]
+    config: Configuration,
+    /// Begin in this map, a map.json of replay, and go on mapping. Where the robot stands in it is looked for.
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
+    /// Only find the way in the map: it stays as it is.
+    #[arg(long, requires = "map")]
+    localise: bool,
+    /// Times as fast as it was recorded; 0 begins paused, `max` goes as fast as it can. The page can change it.
+    #[arg(long, value_name = "TIMES", default_value = "1", value_parser = speed)]
+    speed: Speed,
+    /// Let other computers see the page: an address of this one, or 0.0.0.0 for all, with a port if it is not to be 8017. There is no
+    /// password: whoever reaches it sees the map and can command the robot.
+    #[arg(long, value_name = "ADDRESS[:PORT]", default_value = "127.0.0.1", value_parser = listen)]
+    listen: SocketAddr,
+    /// A name by which other computers know this one; without it the page is to be opened by address.
+    #[arg(long = "host", value_name = "NAME")]
+    names: Vec<String>,
+    /// Do not open the page in a browser.
+    #[arg(long)]
+    no_open: bool,
+}
+
+/// Times as fast as recorded; none is as fast as it can.
+#[derive(Clone, Copy)]
+struct Speed(Option<f32>);
+
+fn speed(text: &str) -> Result<Speed, String> {
+    if text == "max" {
+        return Ok(Speed(None));
+    }
+    let number = text.parse().ok().filter(|v: &f32| v.is_finite() && *v >= 0.0);
+    number.map(|number| Speed(Some(number))).ok_or_else(|| "expected a number, zero or more, or max".into())
+}
+
+fn listen(text: &str) -> Result<SocketAddr, String> {
+    let address = text.parse::<SocketAddr>().ok();
+    let address = address.or_else(|| text.parse::<IpAddr>().ok().map(|ip| (ip, PORT).into()));
+    address.ok_or_else(|| "expected an address such as 127.0.0.1, 0.0.0.0 or 192.168.1.4:8080".into())
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    if args.map.is_some() && args.config != Configuration::Default {
+        return Err(MapFileError::Configuration(args.config.name()).into());
+    }
+    // The port first: a large log takes a while to read.
+    let server = Server::bind(&Options { listen: args.listen, names: args.names.clone() })?;
+    let source = match &args.simulate {
+        Some(world) => simulated(world, args)?,
+        None => recorded(args.log.as_deref().context("no log")?, args)?,
+    };
+    let source = source.start()?;
+    let url = server.url();
+    println!("{url}");
+    if server.is_open() {
+        eprintln!(
+            "warning: whoever reaches {} sees the map and can command the robot: there is no password. Without --listen only this \
+             computer can.",
+            server.address()
+        );
+    }
+    if !args.no_open
+        && let Err(error) = open::that_detached(&url)
+    {
+        eprintln!("warning: no browser could be opened ({error}); open the address above yourself");
+    }
+    eprintln!("Ctrl-C ends it.");
+    server.run(source, async {
+        // Where it cannot be waited for, the system ends the program by itself.
+        if tokio::signal::ctrl_c().await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    })?;
+    Ok(())
+}
+
+fn start(args: &Args) -> anyhow::Result<Start> {
+    let map = args.map.as_deref().map(MapFile::load).transpose()?;
+    Ok(Start { map, pose: None, frozen: args.localise })
+}
+
+fn recorded(path: &Path, args: &Args) -> anyhow::Result<LogSource> {
+    let given = args.robot.as_deref().map(Robot::load).transpose()?;
+    let wheels = given.as_ref().is_some_and(|robot| robot.wheels.is_some());
+    let log = args.reading.read(path, given.as_ref(), wheels)?;
+    warn(&log.warnings);
+    let robot = given.unwrap_or_else(|| log.usual_robot());
+    let title = path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+    Ok(LogSource {
+        log,
+        robot,
+        configuration: args.config,
+        start: start(args)?,
+        speed: args.speed.0,
+        title,
+        blueprint: None,
+    })
+}
+
+fn simulated(world: &Path, args: &Args) -> anyhow::Result<LogSource> {
+    let world = World::load(world)?;
+    let robot = args.robot.as_deref().map_or_else(|| Ok(Robot::usual_for("simulated")), Robot::load)?;
+    let mut errors = SimConfig::default();
+    for setting in &args.settings {
+        errors.set(setting)?;
+    }
+    let drive = sim::drive(&world, &robot, &errors, args.seed)?;
+    let blueprint = judge::blueprint_in_map(&world, &drive);
+    Ok(LogSource {
+        log: drive.log,
+        robot,
+        configuration: args.config,
+        start: start(args)?,
+        speed: args.speed.0,
+        title: format!("{}, seed {}", world.name, args.seed),
+        blueprint: Some(blueprint),
+    })
+}
