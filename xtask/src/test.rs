@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail};
 
 use crate::firmware::EMULATOR;
-use crate::run::{announce, cargo, ensure_target, program, root, step};
+use crate::run::{announce, cargo, debian_package, ensure_target, is_installed, program, root, step};
 use crate::{TARGET, bench, firmware, size};
 
 /// Runs every check, cheapest first; the tests come last and close with their sum.
@@ -42,6 +42,7 @@ pub fn everything() -> anyhow::Result<()> {
     bench::report()?;
     firmware::bench()?;
     let python = python_with_readers();
+    browser();
     tests(python, &elves)
 }
 
@@ -142,6 +143,19 @@ pub(crate) fn python_with_readers() -> Option<PathBuf> {
         Err(error) => {
             eprintln!("{error:#}");
             None
+        }
+    }
+}
+
+/// A browser for the tests of `lineslam live`, from Debian's packages where it is missing and they are at hand. Where it cannot be
+/// installed, those tests say that they were skipped.
+fn browser() {
+    for (package, command) in [("chromium", "chromium"), ("chromium-driver", "chromedriver")] {
+        if !is_installed(command)
+            && is_installed("apt-get")
+            && let Err(error) = debian_package(package, command)
+        {
+            eprintln!("{error:#}");
         }
     }
 }
