@@ -68,7 +68,8 @@ impl Revolution {
         self.rest_us += turns as f32 * self.length_us + off_us * PLACE.max(learning);
         self.length_us += off_us * LENGTH.max(learning) / turns as f32;
         let most = self.nominal_us * WITHIN;
-        self.length_us = self.length_us.clamp(self.nominal_us - most, self.nominal_us + most);
+        // Not `clamp`, whose panic would bring the printing of floating-point numbers along, 15 kB of a microcontroller's flash.
+        self.length_us = self.length_us.max(self.nominal_us - most).min(self.nominal_us + most);
         let whole = self.rest_us as i64;
         self.whole_us += whole;
         self.rest_us -= whole as f32;
