@@ -14,7 +14,7 @@ use slam_core::geometry::pose::components;
 /// Scans in the set, one after the other.
 const SCANS: usize = 300;
 /// Segments of the largest map.
-const SEGMENTS: usize = 1000;
+const SEGMENTS: usize = 500;
 
 fn main() {
     for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {

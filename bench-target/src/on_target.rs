@@ -31,7 +31,7 @@ const PLACES: usize = 256;
 /// The URG-04LX's.
 const BEAMS: usize = 682;
 /// Segments known at the start of a run.
-const KNOWN: [usize; 4] = [50, 200, 500, 1000];
+const KNOWN: [usize; 3] = [50, 200, 500];
 /// Wheels that slip: in one of so many scans the odometry is off by this turn, radians, so that the pose must be searched for.
 const SLIP_SCANS: usize = 5;
 const SLIP_RAD: f32 = 0.4;

@@ -282,7 +282,7 @@ fn a_log_streams_to_its_end_and_the_page_has_what_replay_has() {
         .map
         .iter()
         .map(|s| {
-            [s.segment.start.x, s.segment.start.y, s.segment.end.x, s.segment.end.y]
+            [s.segment().start.x, s.segment().start.y, s.segment().end.x, s.segment().end.y]
                 .map(|v| tenths(f64::from(v)))
         })
         .collect();

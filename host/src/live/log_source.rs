@@ -283,7 +283,7 @@ impl<'a> Player<'a> {
         let news = if segments == self.told.segments { &[][..] } else { segments };
         self.told.segments = segments.to_vec();
         for (index, entry) in news.iter().enumerate() {
-            let (start, end) = (entry.segment.start, entry.segment.end);
+            let (start, end) = (entry.segment().start, entry.segment().end);
             let ends = [start.x, start.y, end.x, end.y];
             let wall = slam.is_wall(index);
             let line = Line { id: index as u32, ends, hits: entry.hits, wall };

@@ -120,6 +120,6 @@ impl Player<'_> {
     }
 }
 
-fn slam_lines<const N: usize, const BEAMS: usize>(slam: &Slam<N, BEAMS>) -> usize {
+fn slam_lines<const N: usize, const BEAMS: usize, const P: usize>(slam: &Slam<N, BEAMS, P>) -> usize {
     slam.map().segments().len()
 }
