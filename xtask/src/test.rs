@@ -22,6 +22,7 @@ pub fn everything() -> anyhow::Result<()> {
         "-p slam-core --features defmt,serde",
         "-p scip",
         "-p scip --all-features",
+        "-p link --features defmt",
         "-p footprint",
         // As it is built: it makes its scans with the whole command, which is not to be built twice.
         "--release -p bench-target",
@@ -31,7 +32,8 @@ pub fn everything() -> anyhow::Result<()> {
         let command = format!("clippy {arguments} --target {TARGET} -- -D warnings");
         step(&format!("clippy for {TARGET}: {arguments}"), &mut cargo(&command))?;
     }
-    let features = "slam-core/defmt,slam-core/serde,scip/defmt,scip/embassy-time,scip/sim,scip/slam-core";
+    let features =
+        "slam-core/defmt,slam-core/serde,scip/defmt,scip/embassy-time,scip/sim,scip/slam-core,link/defmt";
     let mut docs = cargo(&format!(
         "doc --workspace --exclude emulator --exclude firmware --no-deps --features {features}"
     ));
