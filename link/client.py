@@ -34,7 +34,7 @@ def show(body):
     f = Fields(body)
     kind = f.number()
     if kind == 1:
-        number, cause, at_us, samples = (f.number() for _ in range(4))
+        number, at_us, samples = (f.number() for _ in range(3))
         print(f"pose {number} {at_us}", *(f"{value:.6f}" for value in struct.unpack("<3f", f.take(12))))
     elif kind == 6:
         print("ticks", f.number(), f.number(), f.signed(), f.signed(), "and", f.number(), "more")

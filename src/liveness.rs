@@ -10,7 +10,6 @@ use core::sync::atomic::{AtomicU32, Ordering};
 use embassy_time::{Duration, Instant, Ticker};
 
 use crate::board::{ResetCause, Watchdog};
-use crate::console::CONSOLE;
 use crate::resets;
 
 /// Unfed for so long, the watchdog resets the board. Its oscillator of nominally 32 kHz runs at 17 to 47 (DS9405, table 42), so it
@@ -29,8 +28,8 @@ pub enum Task {
     Lidar,
     /// Makes the map.
     Mapping,
-    /// Sends the trajectory. Known by what it takes: it lives if no pose waits for it.
-    Console,
+    /// Sends to a PC.
+    Link,
 }
 
 impl Task {
@@ -38,7 +37,7 @@ impl Task {
         (Self::Encoders, "encoders"),
         (Self::Lidar, "lidar"),
         (Self::Mapping, "mapping"),
-        (Self::Console, "console"),
+        (Self::Link, "link"),
     ];
 
     const fn bit(self) -> u32 {
@@ -99,9 +98,6 @@ pub fn report(cause: ResetCause) {
 pub async fn run(mut watchdog: Watchdog) {
     let mut ticker = Ticker::every(LOOK_EVERY);
     loop {
-        if !CONSOLE.signaled() {
-            SEEN.fetch_or(Task::Console.bit(), Ordering::Relaxed);
-        }
         LOOKS.fetch_add(1, Ordering::Relaxed);
         if SEEN.load(Ordering::Relaxed) & ALL == ALL {
             SEEN.store(MAGIC, Ordering::Relaxed);

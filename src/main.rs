@@ -7,8 +7,6 @@
 #[cfg(target_os = "none")]
 mod board;
 #[cfg(target_os = "none")]
-mod console;
-#[cfg(target_os = "none")]
 mod encoders;
 #[cfg(target_os = "none")]
 mod faults;
@@ -17,6 +15,7 @@ mod kept;
 #[cfg(target_os = "none")]
 mod lidar;
 #[cfg(target_os = "none")]
+mod link;
 mod liveness;
 #[cfg(target_os = "none")]
 mod mapping;

@@ -4,20 +4,21 @@
 
 use core::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
-use embassy_futures::select::{Either, select};
+use ::link::from_robot::{Cause, Event as News};
+use embassy_futures::select::{Either4, select4};
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Receiver;
-use embassy_time::{Duration, Instant, Ticker};
+use embassy_time::{Duration, Instant, Ticker, Timer};
 use slam_core::Segment;
 use slam_core::geometry::pose::components;
 use slam_core::odometry::wheel_faults::WheelFault;
 use slam_core::tracking::TrackingState;
 
 use crate::board::{CORE_HZ, supply};
-use crate::console::{CONSOLE, PoseLine};
 use crate::encoders;
 use crate::kept::{Found, Keeper, Mapper};
 use crate::lidar::{self, STATE, ScanBuffer};
+use crate::link::{Incoming, Load, Outbox, REQUESTS, Restart, View, fault_of, pose_of, state_of};
 use crate::liveness::{self, Task};
 use crate::measure::{self, ScanCycles};
 use crate::resets::Count;
@@ -31,6 +32,10 @@ const COAST_EVERY: Duration = Duration::from_millis(50);
 const COAST_BEHIND_US: u64 = 230_000;
 /// The status is logged so often.
 const STATUS_EVERY: Duration = Duration::from_secs(1);
+/// A scan is held for so long at the most while it is sent.
+const HOLD: Duration = Duration::from_millis(60);
+/// Between the record's last event and a request's so much passes, for whoever reads the record.
+const RECORD_READ: Duration = Duration::from_millis(2);
 /// Segments of the map that are printed at once.
 const PRINT_AT_ONCE: usize = 8;
 
@@ -47,27 +52,49 @@ pub async fn run(
     keeper: Keeper,
     found: Found,
     tracer: Tracer,
+    outbox: &'static mut Outbox,
     mut scans: Receiver<'static, CriticalSectionRawMutex, ScanBuffer>,
 ) {
-    let mut mapping = Mapping::new(keeper, tracer);
+    let mut mapping = Mapping::new(keeper, tracer, outbox);
     if found.is_map() {
         mapping.resume(found);
     }
     let mut ticker = Ticker::every(COAST_EVERY);
     loop {
         liveness::here(Task::Mapping).await;
-        match select(scans.receive(), ticker.next()).await {
-            Either::First(scan) => {
-                if mapping.may_work() {
-                    mapping.take_scan(scan);
-                }
-                scans.receive_done();
+        // While a scan is held it is not received again.
+        let scan = async {
+            match mapping.held {
+                None => scans.receive().await,
+                Some(_) => core::future::pending().await,
             }
-            Either::Second(()) => {
+        };
+        let request = async {
+            Timer::at(mapping.recorded + RECORD_READ).await;
+            REQUESTS.receive().await
+        };
+        let room = mapping.outbox.room(mapping.tracer.samples_taken());
+        match select4(scan, ticker.next(), room, request).await {
+            Either4::First(scan) if mapping.may_work() => {
+                mapping.take_scan(scan);
+                mapping.outbox.look_at_map();
+            }
+            Either4::First(_) => scans.receive_done(),
+            Either4::Second(()) => {
                 if mapping.may_work() {
                     mapping.coast();
                 }
+                mapping.outbox.look_at_map();
             }
+            Either4::Third(()) => {}
+            Either4::Fourth(request) => {
+                if mapping.obey(request) {
+                    Timer::after(RECORD_READ).await;
+                }
+            }
+        }
+        if mapping.publish(scans.try_receive().map(|scan| &*scan)) {
+            scans.receive_done();
         }
         mapping.report();
         mapping.forget_map();
@@ -78,6 +105,17 @@ pub async fn run(
 struct Mapping {
     keeper: Keeper,
     tracer: Tracer,
+    outbox: &'static mut Outbox,
+    load: Load,
+    restart: Restart,
+    /// Since when the last scan is held.
+    held: Option<Instant>,
+    /// When the record was last written.
+    recorded: Instant,
+    /// What was made of messages since the last status.
+    link_us: u64,
+    /// The pose that was set last, as the record has it.
+    set_pose: [u16; 6],
     next_status: Instant,
     scans_at_status: u32,
     last_took_us: u32,
@@ -91,13 +129,21 @@ struct Mapping {
     state: TrackingState,
     fault: Option<WheelFault>,
     restarts: u32,
+    full: u32,
 }
 
 impl Mapping {
-    fn new(keeper: Keeper, tracer: Tracer) -> Self {
+    fn new(keeper: Keeper, tracer: Tracer, outbox: &'static mut Outbox) -> Self {
         Self {
             keeper,
             tracer,
+            outbox,
+            load: Load::default(),
+            restart: Restart::default(),
+            held: None,
+            recorded: Instant::now(),
+            link_us: 0,
+            set_pose: [0; 6],
             next_status: Instant::now() + STATUS_EVERY,
             scans_at_status: 0,
             last_took_us: 0,
@@ -110,19 +156,21 @@ impl Mapping {
             state: TrackingState::Tracking,
             fault: None,
             restarts: 0,
+            full: 0,
         }
     }
 
     fn resume(&mut self, found: Found) {
-        let event = if found == Found::Map {
+        let (event, cause) = if found == Found::Map {
             self.keeper.update(|mapper| mapper.resume());
-            Event::Resumed
+            (Event::Resumed, Cause::Resumed)
         } else {
             // It was put in order when it was taken.
             defmt::warn!("the reset came in the middle of a scan; what was whole of the map is there");
-            Event::Recovered
+            (Event::Recovered, Cause::Recovered)
         };
         self.tracer.event(event, 0, &[], self.keeper.mapper(), 0);
+        self.tell(cause, 0, 0);
         let pose = components(&self.keeper.mapper().slam().pose());
         defmt::info!(
             "the map of {=usize} segments is kept; last seen at x {=f32} m, y {=f32} m, heading {=f32} rad",
@@ -160,7 +208,13 @@ impl Mapping {
         self.last_took_us = took_us;
         self.busy_us += u64::from(took_us);
         self.tracer.event(Event::Scan, scan.middle_us, ranges_mm, self.keeper.mapper(), took_us);
+        self.tell(Cause::Scan, scan.middle_us, took_us);
+        self.outbox.scan(self.tracer.events());
+        self.held = Some(begin);
+        self.load.scan_us = took_us;
+        self.load.longest_scan_us = self.load.longest_scan_us.max(took_us);
         if core::mem::take(&mut self.coasting) {
+            self.outbox.event(News::SensorFound);
             let sigmas = self.keeper.mapper().slam().covariance();
             defmt::info!(
                 "scans again; sure within {=f32} m, {=f32} m, {=f32} rad (sigma)",
@@ -176,14 +230,61 @@ impl Mapping {
             Some(update) => {
                 if let Some(rejected) = update.rejected {
                     defmt::warn!("a scan was not used: {}", rejected);
+                    self.outbox.event(News::ScanRefused);
                 }
                 if update.closure.is_some() {
                     defmt::info!("a loop was closed");
+                    self.outbox.event(News::LoopClosed);
                 }
             }
         }
         self.report_tracking();
-        CONSOLE.signal(PoseLine::new(scan.middle_us, &self.keeper.mapper().slam().pose()));
+    }
+
+    /// Tells a PC of the event that the record has got.
+    fn tell(&mut self, cause: Cause, at_us: u64, took_us: u32) {
+        self.recorded = Instant::now();
+        let (number, samples) = (self.tracer.events(), self.tracer.samples_taken());
+        self.outbox.pose(pose_of([number, samples], cause, at_us, self.keeper.mapper(), took_us));
+    }
+
+    /// Does what a PC asks for. Whether it did something to the map.
+    fn obey(&mut self, incoming: Incoming) -> bool {
+        let Self { keeper, outbox, restart, tracer, .. } = self;
+        let Some(cause) = outbox.obey(incoming, tracer.samples_taken(), keeper, restart) else {
+            return false;
+        };
+        let event = match cause {
+            Cause::Forgotten => Event::Forgotten,
+            Cause::PoseSet(to) => {
+                let [x, y, heading] = to.map(|v| [v.to_bits() as u16, (v.to_bits() >> 16) as u16]);
+                self.set_pose = [x[0], x[1], y[0], y[1], heading[0], heading[1]];
+                Event::PoseSet
+            }
+            Cause::Frozen => Event::Frozen,
+            Cause::Unfrozen => Event::Unfrozen,
+            _ => Event::Relocalising,
+        };
+        let now_us = Instant::now().as_micros();
+        let given: &[u16] = if event == Event::PoseSet { &self.set_pose } else { &[] };
+        self.tracer.event(event, now_us, given, self.keeper.mapper(), 0);
+        self.tell(cause, now_us, 0);
+        self.report_tracking();
+        true
+    }
+
+    /// Sends what there is room for. Whether the scan that is held is needed no longer.
+    fn publish(&mut self, scan: Option<&ScanBuffer>) -> bool {
+        let begin = Instant::now();
+        if self.held.is_some_and(|since| begin - since > HOLD) {
+            self.outbox.cut_scan();
+        }
+        let Self { keeper, tracer, outbox, load, .. } = self;
+        let scan = scan.filter(|_| self.held.is_some());
+        outbox.fill(&View { mapper: keeper.mapper(), tracer, scan, load });
+        self.restart.when_due(outbox);
+        self.link_us += begin.elapsed().as_micros();
+        self.held.is_some() && !self.outbox.is_sending() && self.held.take().is_some()
     }
 
     /// What has changed of the state, and of what is known of the wheels.
@@ -193,6 +294,7 @@ impl Mapping {
         let restarts = mapper.counters().counters_restarted;
         if core::mem::replace(&mut self.state, state) != state {
             TRACKING.store(state as u8, Ordering::Relaxed);
+            self.outbox.event(News::State(state_of(state)));
             match state {
                 TrackingState::Tracking => defmt::info!("tracking again"),
                 TrackingState::Uncertain => defmt::warn!("the pose is uncertain"),
@@ -202,6 +304,7 @@ impl Mapping {
             }
         }
         if core::mem::replace(&mut self.fault, fault) != fault {
+            self.outbox.event(News::Wheels(fault.map(fault_of)));
             match fault {
                 Some(fault) => defmt::warn!("{=str}", fault.message()),
                 None => defmt::info!("the wheels are as they should be again"),
@@ -209,6 +312,7 @@ impl Mapping {
         }
         if core::mem::replace(&mut self.restarts, restarts) != restarts {
             defmt::warn!("the counters restarted");
+            self.outbox.event(News::CountersRestarted);
         }
     }
 
@@ -225,7 +329,9 @@ impl Mapping {
             mapper.coast(until_us)
         });
         self.tracer.event(Event::Coasted, until_us, &[], self.keeper.mapper(), 0);
+        self.tell(Cause::Coasted, until_us, 0);
         if moved.is_some() && !core::mem::replace(&mut self.coasting, true) {
+            self.outbox.event(News::SensorLost);
             defmt::warn!("no scans; going on by odometry alone");
         }
     }
@@ -250,6 +356,14 @@ impl Mapping {
         let scans = STATE.scans.load(Ordering::Relaxed);
         let new = scans.wrapping_sub(core::mem::replace(&mut self.scans_at_status, scans));
         let permille = core::mem::take(&mut self.busy_us) * 1000 / period_us.max(1);
+        self.load.mapping_permille = permille as u16;
+        self.load.link_permille = (core::mem::take(&mut self.link_us) * 1000 / period_us.max(1)) as u16;
+        let counters = slam.map().counters();
+        let full = counters.evicted.saturating_add(counters.refused);
+        if core::mem::replace(&mut self.full, full) < full {
+            self.outbox.event(News::MapFull);
+        }
+        self.outbox.second();
         defmt::info!(
             "x {=f32} y {=f32} heading {=f32}, sigma {=f32} {=f32} {=f32}, {=usize} segments, {=u32} scans in {=u64} ms, \
              update {=u32} us, cpu {=u64} permille, delay {=f32} s, sigma {=f32} s, used {=bool}",
@@ -313,6 +427,7 @@ impl Mapping {
             Err(error) => defmt::error!("the configuration cannot be used: {}", error),
         }
         self.tracer.event(Event::Forgotten, 0, &[], self.keeper.mapper(), 0);
+        self.tell(Cause::Forgotten, 0, 0);
     }
 
     /// A few segments of the map that was asked for, so that the log keeps up.

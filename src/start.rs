@@ -8,9 +8,10 @@ use static_cell::StaticCell;
 use crate::board::{ClockSource, ResetCause};
 use crate::kept::{Found, Keeper, KeptTicks, Mapper, ROOM};
 use crate::lidar::ScanBuffer;
+use crate::link::{Frame, Outbox};
 use crate::resets::Count;
 use crate::trace::Tracer;
-use crate::{board, console, encoders, faults, lidar, liveness, mapping, resets, robot, signs};
+use crate::{board, encoders, faults, lidar, link, liveness, mapping, resets, robot, signs};
 
 #[embassy_executor::main]
 async fn main(spawner: Spawner) {
@@ -59,6 +60,13 @@ async fn main(spawner: Spawner) {
     let buffers = BUFFERS.init([ScanBuffer::EMPTY, ScanBuffer::EMPTY]);
     let (sender, receiver) = SCANS.init(Channel::new(buffers)).split();
 
+    static FRAME: StaticCell<[Frame; 1]> = StaticCell::new();
+    static FRAMES: StaticCell<Channel<'static, CriticalSectionRawMutex, Frame>> = StaticCell::new();
+    // Where it is to stay: a task's arguments are there twice.
+    static OUTBOX: StaticCell<Outbox> = StaticCell::new();
+    let (frames, to_send) = FRAMES.init(Channel::new(FRAME.init([Frame::EMPTY]))).split();
+    let outbox = OUTBOX.init(Outbox::new(frames, cause.into(), found.into()));
+
     let urgent = board::urgent();
     // Each task is spawned once, so there is room for it.
     match (encoders::run(board.encoders, ticks), lidar::run(board.lidar, sender)) {
@@ -69,7 +77,7 @@ async fn main(spawner: Spawner) {
         _ => defmt::error!("an urgent task cannot be spawned"),
     }
     match (
-        mapping::run(keeper, found, Tracer::take(), receiver),
+        mapping::run(keeper, found, Tracer::take(), outbox, receiver),
         signs::run(board.led, board.button),
         liveness::run(watchdog),
     ) {
@@ -80,8 +88,12 @@ async fn main(spawner: Spawner) {
         }
         _ => defmt::error!("a task cannot be spawned"),
     }
-    if let Some(Ok(console)) = board.console.open().map(console::run) {
-        spawner.spawn(console);
+    match board.vcp.open().map(|(tx, rx)| (link::send(tx, to_send), link::receive(rx))) {
+        Some((Ok(send), Ok(receive))) => {
+            spawner.spawn(send);
+            spawner.spawn(receive);
+        }
+        _ => defmt::error!("the link cannot be opened"),
     }
     #[cfg(feature = "misbehaves")]
     if let Some(Ok(failing)) = found.is_map().then(crate::orders::fail_with_map) {

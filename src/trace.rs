@@ -13,7 +13,7 @@ const LAYOUT: u32 = 3;
 
 /// What was done to the map.
 #[repr(u32)]
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Event {
     /// The firmware took up a kept map.
     Resumed = 1,
@@ -23,8 +23,16 @@ pub enum Event {
     Coasted = 3,
     /// The firmware took up a kept map that a reset had left half done; what came before is not to be had.
     Recovered = 4,
-    /// The firmware forgot its map and began a new one.
+    /// The map was forgotten.
     Forgotten = 5,
+    /// The pose was set; in place of ranges stand the halves, lower first, of the bits of x, y and θ as they were given.
+    PoseSet = 6,
+    /// The map was frozen.
+    Frozen = 7,
+    /// The map learns again.
+    Unfrozen = 8,
+    /// The robot has begun to look for itself.
+    Relocalising = 9,
 }
 
 /// The record. Every field is of four or eight bytes, little-endian, without padding between them.
@@ -93,6 +101,21 @@ impl Tracer {
             *slot = ticks;
         }
         self.trace.samples_taken = self.trace.samples_taken.wrapping_add(1);
+    }
+
+    /// Events so far.
+    pub fn events(&self) -> u32 {
+        self.trace.events
+    }
+
+    /// Samples of the wheels taken in so far.
+    pub fn samples_taken(&self) -> u32 {
+        self.trace.samples_taken
+    }
+
+    /// The sample of this number, which must be one of the last [`SAMPLES`].
+    pub fn sample_of(&self, number: u32) -> WheelTicks {
+        self.trace.samples.get(number as usize % SAMPLES).copied().unwrap_or_default()
     }
 
     /// Something was done to the map.

@@ -40,7 +40,7 @@ const REFCLK_DIVIDER: NonZeroU32 = NonZeroU32::new(8).expect("not zero");
 
 /// USART6 among the part's serial ports, USART3 beside it.
 const URG_PORT: usize = 3;
-const CONSOLE_PORT: usize = 2;
+const VCP_PORT: usize = 2;
 /// TIM2, TIM3 and TIM4 among the part's timers.
 const TIME_DRIVER: usize = 0;
 const RIGHT: usize = 1;
@@ -118,7 +118,7 @@ impl Nucleo {
         board.mcu.rcc.attach_crystals(8_000_000, Crystal::NONE.0);
         board.mcu.set_supply(Supply(3300).0);
         board.mcu.usart[URG_PORT].attach(Urg { shared: shared.clone() });
-        board.mcu.usart[CONSOLE_PORT].attach(Console { shared });
+        board.mcu.usart[VCP_PORT].attach(Vcp { shared });
         Ok(board)
     }
 
@@ -288,22 +288,22 @@ impl Peer for Urg {
     }
 }
 
-/// Whoever listens to the virtual COM port.
+/// The other end of the virtual COM port.
 #[derive(Debug)]
-struct Console {
+struct Vcp {
     shared: Shared,
 }
 
-impl Store for Console {}
+impl Store for Vcp {}
 
-impl Peer for Console {
+impl Peer for Vcp {
     fn receive(&mut self, word: u16, _: &mut Timeline<'_, '_>) {
         if let Ok(mut room) = self.shared.lock() {
-            room.console.push(word as u8);
+            room.vcp.from_board.push(word as u8);
         }
     }
 
     fn transmit(&mut self, _: VirtualNanos) -> Option<u16> {
-        None
+        self.shared.lock().ok()?.vcp.to_board.pop_front().map(u16::from)
     }
 }

@@ -17,7 +17,7 @@ use crate::room::Room;
 /// pin), `dma-held@20+0.06` (the DMA that receives is), `held@20+0.06` (the core is, and the DMA goes on), `stamp-wrap` (its stamps
 /// wrap after 20 s), `clock@20=-600000` (the sensor's clock is set ahead by so many milliseconds), `skew=10000` (it is so many parts
 /// in a million fast), `slow=30000` (its revolutions take so many parts in a million longer), `quirk=cr-lf` (see
-/// [`Quirks::EACH`]).
+/// [`Quirks::EACH`]), `vcp-noise@20+5` (from the PC on the virtual COM port, as fast as it takes bytes).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// The sensor's plug is pulled, and put in again after a while.
@@ -87,6 +87,13 @@ pub enum Fault {
         /// When, microseconds.
         at_us: u64,
     },
+    /// The PC sends noise on the virtual COM port, as fast as it takes bytes.
+    VcpNoise {
+        /// When, microseconds.
+        at_us: u64,
+        /// How long, microseconds.
+        for_us: u64,
+    },
     /// Stamps of the sensor wrap soon.
     StampWrap,
     /// Something of the board's own.
@@ -105,6 +112,7 @@ impl FromStr for Fault {
             "unplug" => value.span().map(|(at_us, for_us)| Self::Unplug { at_us, for_us })?,
             "dma-held" => value.span().map(|(at_us, for_us)| Self::Held { at_us, for_us, core: false })?,
             "held" => value.span().map(|(at_us, for_us)| Self::Held { at_us, for_us, core: true })?,
+            "vcp-noise" => value.span().map(|(at_us, for_us)| Self::VcpNoise { at_us, for_us })?,
             "reset" => Self::Reset { at_us: value.micros()? },
             "clock" => value
                 .split('=')
@@ -190,6 +198,7 @@ impl Fault {
             Self::Unplug { .. }
             | Self::Line { .. }
             | Self::Noise { .. }
+            | Self::VcpNoise { .. }
             | Self::Reset { .. }
             | Self::Held { .. }
             | Self::Clock { .. }
@@ -230,6 +239,10 @@ impl Fault {
                 if room.plugged {
                     room.urg.power_cycle(now_us);
                 }
+            }
+            Self::VcpNoise { at_us, for_us } if (at_us..at_us + for_us).contains(&now_us) => {
+                let mut room = shared.lock().map_err(|_| anyhow::anyhow!("the simulation panicked"))?;
+                room.vcp.noise(now_us, grid_us);
             }
             Self::Reset { at_us } if is_now(at_us) => {
                 session.reset_by_pin(stop.at, stop.instruction_count, host);

@@ -15,3 +15,4 @@ pub mod record;
 pub mod report;
 pub mod room;
 pub mod run;
+pub mod vcp;

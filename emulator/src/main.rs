@@ -9,7 +9,8 @@ use clap::Parser;
 use comfy_table::{Table, presets};
 use emulator::fault::Fault;
 use emulator::report::{self, Judged};
-use emulator::run::{Outcome, Plan, Seen, run};
+use emulator::run::{Outcome, Plan, Seen, run_with};
+use emulator::vcp::{self, FarEnd, Nobody, Socket};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use lineslam::output::svg::{self, Picture, Scene};
 use lineslam::output::{self, csv, tum};
@@ -36,12 +37,12 @@ struct Cli {
     /// Length of the run, seconds of virtual time. By default it ends when the path does.
     #[arg(long, value_name = "N")]
     seconds: Option<u64>,
-    /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.jsonl, log.txt, console.tum and report.json.
+    /// Folder for trajectory.tum, truth.tum, map.csv, map.svg, log.jsonl, log.txt, link.bin (all bytes of the virtual COM port), link.tum (its poses) and report.json.
     #[arg(long, value_name = "FOLDER", default_value = "out")]
     out: PathBuf,
     /// What goes wrong: unplug@S+S, garble=N, line=N, noise=N, start-noise=N, streaming=BIT/S, good-to=BIT/S, reset@S, dma-held@S+S,
     /// held@S+S, clock@S=MS, skew=PPM, slow=PPM, quirk=NAME, stamp-wrap, hse-dead, hse-dies@S, power@S=PERMILLE,
-    /// sag@S+S, probe-gone@S+S, hold@S+S, order@S=N, glitch=NS. May be given again.
+    /// sag@S+S, probe-gone@S+S, hold@S+S, order@S=N, glitch=NS, vcp-noise@S+S. May be given again.
     #[arg(long = "fault", value_name = "FAULT")]
     faults: Vec<Fault>,
     /// Change an error of the simulated robot, as in `lineslam simulate`.
@@ -50,6 +51,10 @@ struct Cli {
     /// Have each instruction take as many cycles as the model of the core says. Takes several times as long.
     #[arg(long)]
     cycles: bool,
+    /// Offer the virtual COM port on this TCP port of 127.0.0.1 (0: on any that is free), and run no faster than a real board:
+    /// `lineslam connect --port tcp://127.0.0.1:PORT`.
+    #[arg(long, value_name = "PORT")]
+    vcp: Option<u16>,
     /// Print the firmware's log as it comes.
     #[arg(long)]
     log: bool,
@@ -87,9 +92,17 @@ fn emulate(cli: &Cli) -> anyhow::Result<()> {
         faults: cli.faults.clone(),
         cycles: cli.cycles,
     };
+    let far_end: Box<dyn FarEnd> = match cli.vcp {
+        Some(port) => {
+            let socket = Socket::listen(port)?;
+            eprintln!("the virtual COM port is tcp://{}", socket.address()?);
+            Box::new(socket)
+        }
+        None => Box::new(Nobody),
+    };
     let bar = progress_bar();
     let (shown, with_log) = (bar.clone(), cli.log);
-    let outcome = run(&plan, move |seen| match seen {
+    let outcome = run_with(&plan, far_end, move |seen| match seen {
         Seen::Line(line) if with_log => shown.suspend(|| println!("{line}")),
         Seen::Line(_) => {}
         Seen::Progress(p) => {
@@ -138,6 +151,7 @@ fn files(
         blueprint: &blueprint,
         ..Scene::default()
     };
+    let poses = vcp::scan_poses(&outcome.vcp);
     let log: String = outcome.log.iter().map(|line| format!("{line}\n")).collect();
     let mut report = serde_json::to_vec_pretty(&judged.report).context("report.json")?;
     report.push(b'\n');
@@ -148,7 +162,8 @@ fn files(
         ("map.svg", svg::render(&picture, &scene).into_bytes()),
         ("log.jsonl", report::log_text(judged, robot).into_bytes()),
         ("log.txt", log.into_bytes()),
-        ("console.tum", outcome.console.clone().into_bytes()),
+        ("link.tum", tum::render(poses.iter().map(|(stamp_us, pose)| (*stamp_us, pose))).into_bytes()),
+        ("link.bin", outcome.vcp.clone()),
         ("report.json", report),
     ])
 }

@@ -37,6 +37,16 @@ pub enum Event {
         /// Where it was to end, on the firmware's clock.
         until_us: u64,
     },
+    /// The map was forgotten.
+    Forgotten,
+    /// The pose was set to these x, y and θ.
+    PoseSet([f32; 3]),
+    /// The map was frozen.
+    Frozen,
+    /// The map learns again.
+    Unfrozen,
+    /// The robot has begun to look for itself.
+    Relocalising,
 }
 
 /// An event with what led to it and what came of it.
@@ -117,19 +127,28 @@ impl Recorder {
         let at_us = read_u64(host, rest)?;
         let word = |host: &mut dyn Host, k: u64| host.read(rest + 8 + 4 * k, Width::W32).map(|w| w as u32);
         let float = |host: &mut dyn Host, k: u64| word(host, k).map(f32::from_bits);
+        let ranges = [word(host, 0)?, word(host, 1)?];
         let event = match kind {
             1 => Event::Resumed,
             4 => Event::Recovered,
             5 => Event::Forgotten,
             2 => {
-                let (from, len) = (u64::from(word(host, 0)?), u64::from(word(host, 1)?));
-                let mut ranges_mm = Vec::new();
-                for k in 0..len {
-                    ranges_mm.push(host.read(from + 2 * k, Width::W16)? as u16);
-                }
+                let ranges_mm = halves(host, ranges)?;
                 let (took_us, revolution_us) = (word(host, 9)?, word(host, 11)?);
                 Event::Scan { middle_us: at_us, ranges_mm, took_us, revolution_us }
             }
+            5 => Event::Forgotten,
+            6 => {
+                let halves = halves(host, ranges)?;
+                let [a, b, c, d, e, f] = halves[..] else {
+                    anyhow::bail!("a pose of {} halves", halves.len())
+                };
+                let float = |low, high| f32::from_bits(u32::from(low) | u32::from(high) << 16);
+                Event::PoseSet([float(a, b), float(c, d), float(e, f)])
+            }
+            7 => Event::Frozen,
+            8 => Event::Unfrozen,
+            9 => Event::Relocalising,
             3 => Event::Coasted { until_us: at_us },
             other => anyhow::bail!("an event of kind {other}"),
         };
@@ -144,6 +163,15 @@ impl Recorder {
         });
         Ok(true)
     }
+}
+
+/// Halves of words from an address on, so many of them.
+fn halves(host: &mut dyn Host, [from, len]: [u32; 2]) -> anyhow::Result<Vec<u16>> {
+    let mut halves = Vec::new();
+    for k in 0..u64::from(len) {
+        halves.push(host.read(u64::from(from) + 2 * k, Width::W16)? as u16);
+    }
+    Ok(halves)
 }
 
 /// The state that the firmware wrote as a number.

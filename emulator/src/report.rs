@@ -7,6 +7,7 @@ use lineslam::sim::world::World;
 use lineslam::sim::{Drive, UnitErrors};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
+use slam_core::geometry::pose::pose;
 use slam_core::odometry::Integration;
 use slam_core::sensor::scan::Reading;
 use slam_core::tracking::TrackingState;
@@ -253,26 +254,9 @@ pub struct Difference {
 /// Where a PC, fed the same ticks and scans, parts from the firmware: `None` if it never does.
 /// A reset in the middle of a scan leaves what no PC can know; the comparison ends there.
 pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Option<Difference>> {
-    let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
-    // The sizes of `src/kept.rs`.
-    let mut mapper = Box::new(Mapper::<1024, 64, 682, 256>::new(robot.config(), drive)?);
-    let known = entries.iter().take_while(|e| e.event != Event::Recovered);
-    for (number, entry) in known.enumerate() {
-        if entry.event == Event::Resumed {
-            mapper.resume();
-        }
-        for sample in &entry.samples {
-            mapper.push(*sample);
-        }
-        match &entry.event {
-            Event::Resumed | Event::Recovered => {}
-            Event::Forgotten => *mapper = Mapper::new(robot.config(), drive)?,
-            Event::Scan { middle_us, ranges_mm, revolution_us, .. } => {
-                mapper.set_revolution_us(*revolution_us);
-                let _ = mapper.scan(*middle_us, ranges_mm);
-            }
-            Event::Coasted { until_us } => drop(mapper.coast(*until_us)),
-        }
+    let mut mapper = mapper(robot)?;
+    for (number, entry) in known(entries).enumerate() {
+        follow(&mut mapper, entry, robot)?;
         let here = slam_core::geometry::pose::components(&mapper.slam().pose());
         let same = (0..3).all(|i| here[i].to_bits() == entry.pose[i].to_bits())
             && mapper.slam().map().segments().len() == entry.segments as usize
@@ -284,4 +268,46 @@ pub fn first_difference(entries: &[Entry], robot: &Robot) -> anyhow::Result<Opti
         }
     }
     Ok(None)
+}
+
+/// The mapper of a PC that was fed the same ticks and scans, as far as they are known.
+pub fn replayed(entries: &[Entry], robot: &Robot) -> anyhow::Result<Box<FirmwareMapper>> {
+    let mut mapper = mapper(robot)?;
+    known(entries).try_for_each(|entry| follow(&mut mapper, entry, robot))?;
+    Ok(mapper)
+}
+
+/// The sizes of `src/kept.rs`.
+pub type FirmwareMapper = Mapper<1024, 64, 682, 256>;
+
+fn mapper(robot: &Robot) -> anyhow::Result<Box<FirmwareMapper>> {
+    let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;
+    Ok(Box::new(Mapper::new(robot.config(), drive)?))
+}
+
+fn known(entries: &[Entry]) -> impl Iterator<Item = &Entry> {
+    entries.iter().take_while(|e| e.event != Event::Recovered)
+}
+
+/// Does what the firmware did.
+fn follow(mapper: &mut FirmwareMapper, entry: &Entry, robot: &Robot) -> anyhow::Result<()> {
+    if entry.event == Event::Resumed {
+        mapper.resume();
+    }
+    for sample in &entry.samples {
+        mapper.push(*sample);
+    }
+    match &entry.event {
+        Event::Resumed | Event::Recovered => {}
+        Event::Scan { middle_us, ranges_mm, revolution_us, .. } => {
+            mapper.set_revolution_us(*revolution_us);
+            let _ = mapper.scan(*middle_us, ranges_mm);
+        }
+        Event::Coasted { until_us } => drop(mapper.coast(*until_us)),
+        Event::Forgotten => *mapper = Mapper::new(robot.config(), robot.drive())?,
+        Event::PoseSet([x, y, heading]) => mapper.set_pose(pose(*x, *y, *heading)),
+        Event::Frozen | Event::Unfrozen => mapper.set_mapping(entry.event == Event::Unfrozen),
+        Event::Relocalising => mapper.relocalise(),
+    }
+    Ok(())
 }

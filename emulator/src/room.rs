@@ -1,5 +1,7 @@
 //! The world around the board: a building, a base that drives through it, the sensor, and the encoders' edges.
 
+use std::collections::VecDeque;
+
 use lineslam::robot::Robot;
 use lineslam::sim::base::Base;
 use lineslam::sim::scanner::{Moment, Scanner};
@@ -168,10 +170,21 @@ pub struct Room {
     pub host_rate: u32,
     /// Whether the sensor's plug is in.
     pub plugged: bool,
-    /// What came over the virtual COM port.
-    pub console: Vec<u8>,
+    /// The virtual COM port.
+    pub vcp: Line,
     /// Draws as the port's own model does which bytes come with noise, where that is not to change them.
     pub flagged: Option<Errors>,
+}
+
+/// A serial line: bytes that have crossed it, and bytes that wait to.
+#[derive(Debug, Default)]
+pub struct Line {
+    /// All that the microcontroller has sent.
+    pub from_board: Vec<u8>,
+    /// How many of these the other end has been told.
+    pub told: usize,
+    /// What is sent to it, at the bit rate of its port.
+    pub to_board: VecDeque<u8>,
 }
 
 impl Room {
@@ -182,7 +195,7 @@ impl Room {
             urg: SimulatedUrg::new(0, seed),
             host_rate: 0,
             plugged: true,
-            console: Vec::new(),
+            vcp: Line::default(),
             flagged: None,
         }
     }

@@ -26,6 +26,7 @@ use crate::firmware::{Log, LogLine, Symbols};
 use crate::paced::Pace;
 use crate::record::{Entry, Recorder};
 use crate::room::{Building, Edge, Room, TrueScan};
+use crate::vcp::{FarEnd, Nobody};
 
 /// The world is looked at this often, microseconds.
 const GRID_US: u64 = 1000;
@@ -93,7 +94,7 @@ pub struct Outcome {
     /// Scans as the sensor measured and sent them.
     pub scans: Vec<TrueScan>,
     /// What came over the virtual COM port.
-    pub console: String,
+    pub vcp: Vec<u8>,
     /// Resets, by what caused them, with their virtual time in microseconds.
     pub resets: Vec<(u64, String)>,
     /// Times that the LED was switched.
@@ -116,6 +117,15 @@ pub struct Outcome {
 
 /// Runs the plan. `see` is shown the log as it comes, and how far the run is.
 pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::Result<Outcome> {
+    run_with(plan, Nobody, see)
+}
+
+/// The same with somebody at the other end of the virtual COM port.
+pub fn run_with(
+    plan: &Plan<'_>,
+    vcp: impl FarEnd + 'static,
+    see: impl FnMut(Seen) + Send + 'static,
+) -> anyhow::Result<Outcome> {
     let elf = std::fs::read(plan.elf).with_context(|| plan.elf.display().to_string())?;
     let symbols = Symbols::read(&elf, plan.elf)?;
     let building = Building::new(plan.world, plan.robot, &plan.sim, plan.seed)?;
@@ -151,6 +161,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         order: symbols.order,
         rng: Pcg64::seed_from_u64(plan.seed),
         edges_seen: 0,
+        vcp: Box::new(vcp),
         see: Box::new(see),
         failure: None,
     };
@@ -176,7 +187,7 @@ pub fn run(plan: &Plan<'_>, see: impl FnMut(Seen) + Send + 'static) -> anyhow::R
         entries: director.recorder.entries,
         log: director.lines,
         scans: std::mem::take(&mut room.building.scans),
-        console: String::from_utf8_lossy(&room.console).into_owned(),
+        vcp: std::mem::take(&mut room.vcp.from_board),
         resets,
         led_changes: director.led_changes,
         flash_accelerated: director.flash_accelerated,
@@ -211,6 +222,7 @@ struct Director {
     order: Option<u64>,
     rng: Pcg64,
     edges_seen: usize,
+    vcp: Box<dyn FarEnd>,
     see: Box<dyn FnMut(Seen) + Send>,
     failure: Option<anyhow::Error>,
 }
@@ -323,6 +335,10 @@ impl Director {
             fault.at(now_us, GRID_US, session, host, around)?;
         }
         self.edges.extend(edges);
+        {
+            let mut room = self.shared.lock().map_err(|_| anyhow!("the simulation panicked"))?;
+            room.vcp.exchange(self.vcp.as_mut(), now_us)?;
+        }
         for fault in &self.faults {
             fault.at(now_us, GRID_US, session, &self.shared, stop, host)?;
         }

@@ -72,7 +72,7 @@ fn hang(order: u32, words: &str) -> Outcome {
 
 #[test]
 fn each_task_that_hangs_is_reset_and_named() {
-    for (order, task) in [(1, "encoders"), (2, "lidar"), (3, "mapping"), (4, "console")] {
+    for (order, task) in [(1, "encoders"), (2, "lidar"), (3, "mapping"), (4, "link")] {
         let outcome = hang(order, &format!("no word from the task {task}"));
         assert_eq!(
             outcome.log.iter().filter(|line| line.text.contains("the last run hung")).count(),

@@ -76,6 +76,8 @@ pub enum KeptMap {
     HalfDone,
     /// It was damaged: a new one has begun.
     Damaged,
+    /// The robot failed with it again and again: a new one has begun.
+    GivenUp,
 }
 
 /// How beams lie.
@@ -123,7 +125,7 @@ pub struct Hello {
 }
 
 /// What was done to the map.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Cause {
     /// A kept map was taken up.
     Resumed,
@@ -135,8 +137,8 @@ pub enum Cause {
     Coasted,
     /// The map was forgotten.
     Forgotten,
-    /// The pose was set to that which was commanded; the scans to come correct it.
-    PoseSet,
+    /// The pose was set to this one (x, y, θ); the scans to come correct it.
+    PoseSet([f32; 3]),
     /// The map was frozen.
     Frozen,
     /// The map learns again.
@@ -161,8 +163,6 @@ pub enum State {
 pub struct Pose {
     /// Of what was done, counted from 1 at each reset.
     pub number: u32,
-    /// What was done.
-    pub cause: Cause,
     /// The scan's middle beam, or where coasting was to end, or now; microseconds.
     pub at_us: u64,
     /// Samples of the wheels taken in by then, since the reset.
@@ -177,6 +177,8 @@ pub struct Pose {
     pub lines: u16,
     /// What the work took, microseconds.
     pub took_us: u32,
+    /// What was done.
+    pub cause: Cause,
 }
 
 /// What has been counted of the mapping since the reset, and how it stands.

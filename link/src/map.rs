@@ -4,6 +4,7 @@
 //! has missed a line has another check and asks for the block. So nothing is lost for good, whatever is lost on the way, and
 //! neither end keeps a history: the check is the generation of a block, and stays so across resets of both.
 
+use crc::{Digest, Table};
 use serde::{Deserialize, Serialize};
 
 use crate::frame::CRC;
@@ -44,23 +45,49 @@ impl Line {
     }
 }
 
+/// A check on its way.
+pub struct Check(Digest<'static, u32, Table<1>>);
+
+impl Default for Check {
+    fn default() -> Self {
+        Self(CRC.digest())
+    }
+}
+
+impl Check {
+    /// Takes a line of the block.
+    pub fn take_line(&mut self, line: &Line) {
+        self.take(line);
+    }
+
+    /// Takes the pose of a place.
+    pub fn take_place(&mut self, pose: &[f32; 3]) {
+        self.take(pose);
+    }
+
+    /// There is room for either.
+    fn take(&mut self, item: &impl Serialize) {
+        if let Ok(bytes) = postcard::to_slice(item, &mut [0; LINE_BYTES]) {
+            self.0.update(bytes);
+        }
+    }
+
+    /// What it is.
+    pub fn check(self) -> u32 {
+        self.0.finalize()
+    }
+}
+
 /// Check of a block: the CRC-32 of its lines' bytes one after the other.
 pub fn block_check<'a>(lines: impl IntoIterator<Item = &'a Line>) -> u32 {
-    check_of_all(lines, &mut [0; LINE_BYTES])
+    let mut check = Check::default();
+    lines.into_iter().for_each(|line| check.take_line(line));
+    check.check()
 }
 
 /// Check of all places: the CRC-32 of their poses' bytes.
 pub fn places_check<'a>(poses: impl IntoIterator<Item = &'a [f32; 3]>) -> u32 {
-    check_of_all(poses, &mut [0; size_of::<[f32; 3]>()])
-}
-
-/// There must be room for one of them.
-fn check_of_all<'a, T: Serialize + 'a>(items: impl IntoIterator<Item = &'a T>, room: &mut [u8]) -> u32 {
-    let mut digest = CRC.digest();
-    for item in items {
-        if let Ok(bytes) = postcard::to_slice(item, room) {
-            digest.update(bytes);
-        }
-    }
-    digest.finalize()
+    let mut check = Check::default();
+    poses.into_iter().for_each(|pose| check.take_place(pose));
+    check.check()
 }

@@ -150,6 +150,11 @@ impl<const N: usize, const K: usize, const BEAMS: usize, const P: usize> Mapper<
         self.slam.set_mapping(mapping);
     }
 
+    /// The robot stands near a pose in its map, see [`Slam::set_pose`].
+    pub fn set_pose(&mut self, pose: Isometry2<f32>) {
+        self.slam.set_pose(pose);
+    }
+
     /// The robot may be anywhere in its map, see [`Slam::relocalise`].
     pub fn relocalise(&mut self) {
         self.slam.relocalise();

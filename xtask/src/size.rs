@@ -12,7 +12,7 @@ use crate::run::{announce, cargo, step, target_folder};
 
 /// Flash that the firmware may take: code, constants, and what variables begin with. The part has 2048 KiB; the budget is there to
 /// have growth noticed.
-const FLASH_BUDGET: u64 = 224 * 1024;
+const FLASH_BUDGET: u64 = 240 * 1024;
 /// RAM that it may take, the map among it, less the stack, which is measured as it runs: a test of the emulated board holds both together
 /// to 190 KiB of 192.
 const RAM_BUDGET: u64 = (190 - STACK_KIB) * 1024;

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use emulator::fault::Fault;
 use emulator::record::{Entry, Event};
 use emulator::report::{self, Judged};
-use emulator::run::{Outcome, Plan, run};
+use emulator::run::{Outcome, Plan, run_with};
+use emulator::vcp::{FarEnd, Nobody};
 use lineslam::robot::Robot;
 use lineslam::sim::SimConfig;
 use lineslam::sim::world::World;
@@ -51,11 +52,27 @@ pub fn hall_in_cycles(seconds: Option<u64>) -> (Outcome, Judged) {
     run_at("lineslam", seconds, Vec::new(), true)
 }
 
+/// Runs the firmware that is flashed in the hall, with somebody at the virtual COM port.
+pub fn hall_with(vcp: impl FarEnd + 'static, seconds: Option<u64>, faults: &[&str]) -> (Outcome, Judged) {
+    let faults = faults.iter().map(|f| f.parse::<Fault>().expect("a fault")).collect();
+    run_with_far_end("lineslam", vcp, seconds, faults, false)
+}
+
 fn run_at(build: &str, seconds: Option<u64>, faults: Vec<Fault>, cycles: bool) -> (Outcome, Judged) {
+    run_with_far_end(build, Nobody, seconds, faults, cycles)
+}
+
+fn run_with_far_end(
+    build: &str,
+    vcp: impl FarEnd + 'static,
+    seconds: Option<u64>,
+    faults: Vec<Fault>,
+    cycles: bool,
+) -> (Outcome, Judged) {
     let (world, robot, seed) = (world("hall"), robot(), 11);
     let (elf, sim) = (elf(build), SimConfig::default());
     let plan = Plan { elf: &elf, world: &world, robot: &robot, sim, seed, seconds, faults, cycles };
-    let outcome = run(&plan, |_| ()).unwrap_or_else(|error| panic!("{error:#}"));
+    let outcome = run_with(&plan, vcp, |_| ()).unwrap_or_else(|error| panic!("{error:#}"));
     let judged = report::judge(&world, seed, &outcome).expect("a run that can be judged");
     (outcome, judged)
 }

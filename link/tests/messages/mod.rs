@@ -45,7 +45,7 @@ pub fn largest() -> [FromRobot; 12] {
         }),
         FromRobot::Pose(Pose {
             number: most,
-            cause: Cause::Relocalising,
+            cause: Cause::PoseSet([far; 3]),
             at_us: u64::MAX,
             samples: most,
             pose: [far; 3],

@@ -67,6 +67,14 @@ impl<const N: usize, const BEAMS: usize, const P: usize> Slam<N, BEAMS, P> {
         self.mapping = mapping;
     }
 
+    /// The robot stands near a pose in its map, within some 20 cm and 6°: it goes on from there, and the scans to come correct it.
+    pub fn set_pose(&mut self, pose: Isometry2<f32>) {
+        // What the last keyframe has still to say is said from where it was seen.
+        let (estimator, mut around) = self.estimator();
+        estimator.commit(&mut around);
+        self.jump(&Prior { pose, covariance: diagonal(THOUGHT) });
+    }
+
     /// See [`Self::set_mapping`].
     pub fn is_mapping(&self) -> bool {
         self.mapping
