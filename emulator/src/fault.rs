@@ -105,7 +105,7 @@ impl FromStr for Fault {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let Some((name, value)) = text.split_once(['@', '=']) else {
-            return if text == "stamp-wrap" { Ok(Self::StampWrap) } else { Self::of_board(text) };
+            return if text == "stamp-wrap" { Ok(Self::StampWrap) } else { board_fault(text) };
         };
         let value = Value(value);
         Ok(match name {
@@ -126,15 +126,13 @@ impl FromStr for Fault {
             "skew" => Self::Skew { ppm: value.number()? },
             "slow" => Self::Slow { ppm: value.number()? },
             "quirk" => Self::Quirk(value.quirk()?),
-            _ => return Self::of_board(text),
+            _ => return board_fault(text),
         })
     }
 }
 
-impl Fault {
-    fn of_board(text: &str) -> Result<Self, String> {
-        text.parse().map(Self::Board).map_err(|_| EXPECTED.into())
-    }
+fn board_fault(text: &str) -> Result<Fault, String> {
+    text.parse().map(Fault::Board).map_err(|_| EXPECTED.into())
 }
 
 const EXPECTED: &str = "expected unplug@S+S, garble=N, line=N, noise=N, start-noise=N, streaming=BIT/S, good-to=BIT/S, reset@S, \

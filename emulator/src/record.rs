@@ -19,8 +19,6 @@ pub enum Event {
     Resumed,
     /// A kept map was taken up that a reset had left half done.
     Recovered,
-    /// The firmware forgot its map and began a new one.
-    Forgotten,
     /// A scan was taken in.
     Scan {
         /// Its middle beam on the firmware's clock.
@@ -131,7 +129,6 @@ impl Recorder {
         let event = match kind {
             1 => Event::Resumed,
             4 => Event::Recovered,
-            5 => Event::Forgotten,
             2 => {
                 let ranges_mm = halves(host, ranges)?;
                 let (took_us, revolution_us) = (word(host, 9)?, word(host, 11)?);

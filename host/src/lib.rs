@@ -7,6 +7,7 @@ pub mod benchmark;
 pub mod calibrate;
 pub mod configuration;
 pub mod experiments;
+pub mod link;
 pub mod live;
 pub mod log;
 pub mod map_file;

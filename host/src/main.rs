@@ -6,7 +6,7 @@ mod commands;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use commands::{benchmark, calibrate, experiments, live, replay, scan, score, simulate};
+use commands::{benchmark, calibrate, connect, experiments, live, replay, scan, score, simulate};
 use lineslam::benchmark::BenchmarkError;
 use lineslam::calibrate::CalibrationError;
 use lineslam::experiments::ExperimentError;
@@ -39,6 +39,8 @@ enum Command {
     Calibrate(calibrate::Args),
     /// Run the paper's experiments and more, and write the page with tables and figures.
     Experiments(experiments::Args),
+    /// See what the robot does, and tell it what to do.
+    Connect(connect::Args),
     /// Watch a log or a simulated drive being mapped, in the browser.
     Live(live::Args),
     /// Ask a sensor on a serial port who it is and draw one of its scans.
@@ -53,6 +55,7 @@ fn main() -> ExitCode {
         Command::Benchmark(args) => benchmark::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Experiments(args) => experiments::run(&args),
+        Command::Connect(args) => connect::run(&args),
         Command::Live(args) => live::run(&args),
         Command::Scan(args) => scan::run(&args),
     };

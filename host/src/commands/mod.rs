@@ -3,6 +3,7 @@
 pub mod benchmark;
 pub mod calibrate;
 pub mod common;
+pub mod connect;
 pub mod experiments;
 pub mod live;
 pub mod log_args;

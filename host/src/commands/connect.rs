@@ -1,0 +1,283 @@
+//! `lineslam connect`.
+
+use std::io::{IsTerminal, Write, stderr, stdin};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use lineslam::link::from_robot::{Cause, Event, Health, Hello, Outcome, Pose, State, Status};
+use lineslam::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams};
+use lineslam::output::tum;
+use slam_core::geometry::pose::pose;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Port of the robot: a device such as /dev/ttyACM0, or tcp://HOST:PORT of `cargo xtask emulate --vcp PORT`. By default that of the
+    /// ST-LINK that is plugged in.
+    #[arg(long, value_name = "PORT", global = true)]
+    port: Option<Address>,
+    /// Print the trajectory, a line of TUM format for each scan.
+    #[arg(long)]
+    tum: bool,
+    /// End after so many seconds.
+    #[arg(long, value_name = "N")]
+    seconds: Option<u64>,
+    #[command(subcommand)]
+    ask: Option<Ask>,
+}
+
+/// What to ask of the robot.
+#[derive(clap::Subcommand)]
+enum Ask {
+    /// Forget the map and begin a new one here.
+    Forget {
+        /// Do not ask whether it is meant so.
+        #[arg(long)]
+        yes: bool,
+    },
+    /// Say where the robot stands in its map: within some 20 cm and 6 degrees.
+    SetPose {
+        /// Metres.
+        #[arg(allow_negative_numbers = true)]
+        x: f32,
+        /// Metres.
+        #[arg(allow_negative_numbers = true)]
+        y: f32,
+        /// Heading, degrees.
+        #[arg(allow_negative_numbers = true)]
+        deg: f32,
+    },
+    /// Leave the map as it is, and only find the way in it.
+    Freeze,
+    /// Let the map learn again.
+    Unfreeze,
+    /// Find yourself: the robot may be anywhere in its map.
+    Find,
+    /// Print the map: both ends of each line (metres), scans that saw it, and whether it is a wall, as CSV.
+    Map,
+    /// Reset the board; the map is kept.
+    Restart,
+}
+
+/// A map that is not whole by then has something wrong.
+const WHOLE_MAP: Duration = Duration::from_secs(20);
+/// Nothing was heard for so long: it is said.
+const SILENCE: Duration = Duration::from_secs(3);
+/// A port that is gone is tried again this often.
+const RETRY: Duration = Duration::from_millis(500);
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let address = args.port.clone().map_or_else(Address::find, Ok)?;
+    match &args.ask {
+        Some(ask) => tell(&address, ask),
+        None => watch(args, &address),
+    }
+}
+
+fn tell(address: &Address, ask: &Ask) -> anyhow::Result<()> {
+    let (command, done) = match ask {
+        Ask::Forget { yes } => {
+            if !yes && !confirmed()? {
+                println!("the map stays");
+                return Ok(());
+            }
+            (Command::Forget, "the map is forgotten, and a new one begins")
+        }
+        Ask::SetPose { x, y, deg } => {
+            (Command::SetPose([*x, *y, deg.to_radians()]), "the robot goes on from there")
+        }
+        Ask::Freeze => (Command::SetMapping(false), "the map stays as it is"),
+        Ask::Unfreeze => (Command::SetMapping(true), "the map learns"),
+        Ask::Find => (Command::Relocalise, "the robot looks for itself"),
+        Ask::Restart => (Command::Restart, "the board restarts"),
+        Ask::Map => return print_map(address),
+    };
+    order(&mut Client::connect(address)?, command)?;
+    println!("{done}");
+    Ok(())
+}
+
+/// Has it done.
+fn order(client: &mut Client, command: Command) -> anyhow::Result<()> {
+    match client.request(command)? {
+        Outcome::Done => Ok(()),
+        Outcome::Unknown => bail!("{}: the robot's firmware does not know this", client.address()),
+        Outcome::OutOfRange => bail!("{}: the robot refuses: a number makes no sense", client.address()),
+        Outcome::NotConfigured => bail!("{}: the robot is not configured to do this", client.address()),
+    }
+}
+
+fn confirmed() -> anyhow::Result<bool> {
+    if !stdin().is_terminal() {
+        bail!("the robot would forget its map: say so with --yes");
+    }
+    eprint!("Forget the robot's map? It cannot be had back. [y/N] ");
+    stderr().flush()?;
+    let mut answer = String::new();
+    stdin().read_line(&mut answer).context("the answer")?;
+    Ok(matches!(answer.trim(), "y" | "Y" | "yes"))
+}
+
+fn print_map(address: &Address) -> anyhow::Result<()> {
+    let mut client = Client::connect(address)?;
+    order(&mut client, Command::Subscribe(Streams::DEFAULT.with(Streams::MAP)))?;
+    order(&mut client, Command::SendMap { blocks: u32::MAX, places: true })?;
+    let mut map = MapCopy::default();
+    let begun = Instant::now();
+    while !map.is_whole() {
+        if begun.elapsed() > WHOLE_MAP {
+            bail!("{address}: the map has not come whole within {} s", WHOLE_MAP.as_secs());
+        }
+        if let Some(message) = client.next(RETRY)?
+            && let Some(again) = map.take(&message)
+        {
+            client.send(again)?;
+        }
+    }
+    order(&mut client, Command::Subscribe(Streams::DEFAULT))?;
+    println!("x0,y0,x1,y1,scans,wall");
+    for (_, line) in map.lines() {
+        let ([x0, y0], [x1, y1]) = (line.start_m, line.end_m);
+        println!("{x0},{y0},{x1},{y1},{},{}", line.hits, line.is_wall);
+    }
+    Ok(())
+}
+
+/// Shows what comes until it is interrupted, through resets and pulled cables.
+fn watch(args: &Args, address: &Address) -> anyhow::Result<()> {
+    let end = args.seconds.map(|seconds| Instant::now() + Duration::from_secs(seconds));
+    let is_over = || end.is_some_and(|end| Instant::now() >= end);
+    // The first time it must be there.
+    let mut client = Some(Client::connect(address)?);
+    let mut shown = Shown { tum: args.tum, ..Shown::default() };
+    while !is_over() {
+        let Some(open) = &mut client else {
+            std::thread::sleep(RETRY);
+            client = Client::connect(address).ok();
+            continue;
+        };
+        if let Err(error) = show(open, &mut shown, &is_over) {
+            eprintln!("{error}: waiting for it to come back");
+            client = None;
+        }
+    }
+    if shown.messages == 0 {
+        bail!("{address}: nothing was heard; is the firmware of this version on the board?");
+    }
+    Ok(())
+}
+
+fn show(client: &mut Client, shown: &mut Shown, is_over: &impl Fn() -> bool) -> Result<(), LinkError> {
+    client.send(Command::Subscribe(Streams::DEFAULT))?;
+    client.send(Command::Hello)?;
+    let (mut heard, mut is_silent) = (Instant::now(), false);
+    while !is_over() {
+        match client.next(Duration::from_millis(100))? {
+            Some(message) => {
+                (heard, is_silent) = (Instant::now(), false);
+                shown.take(&message);
+            }
+            None if heard.elapsed() > SILENCE && !is_silent => {
+                is_silent = true;
+                eprintln!("nothing has been heard for {} s: what is above is old", SILENCE.as_secs());
+            }
+            None => {}
+        }
+    }
+    Ok(())
+}
+
+/// What is known for the next line.
+#[derive(Default)]
+struct Shown {
+    tum: bool,
+    messages: u64,
+    pose: Option<Pose>,
+    status: Option<Status>,
+}
+
+impl Shown {
+    fn take(&mut self, message: &FromRobot) {
+        self.messages += 1;
+        match message {
+            FromRobot::Pose(of) => {
+                if self.tum && of.cause == Cause::Scan {
+                    let [x, y, heading] = of.pose;
+                    print!("{}", tum::render([(of.at_us, &pose(x, y, heading))].into_iter()));
+                }
+                self.pose = Some(*of);
+            }
+            // Nothing but the trajectory.
+            _ if self.tum => {}
+            FromRobot::Hello(hello) => print_hello(hello),
+            FromRobot::Event(happened) => {
+                println!("{:9.1} s  {}", seconds(happened.at_us), in_words(&happened.event));
+            }
+            FromRobot::Status(status) => self.status = Some(status.clone()),
+            FromRobot::Health(health) => self.line(health),
+            _ => {}
+        }
+    }
+
+    /// A line once a second.
+    fn line(&mut self, health: &Health) {
+        let (Some(pose), Some(status)) = (&self.pose, &self.status) else { return };
+        let [x, y, heading] = pose.pose;
+        let sigma_m = (pose.covariance[0].max(0.0) + pose.covariance[3].max(0.0)).sqrt();
+        let lost =
+            status.sensor_missed + status.sensor_dropped + status.samples_dropped + health.scans_unsent;
+        println!(
+            "{:9.1} s  x {x:.3} y {y:.3} m, {:.1}°, sure within {sigma_m:.3} m; {}{}; {} lines, {} places; {} scans; {:.1} ms a scan, cpu {:.1} %; lost {lost}",
+            seconds(health.uptime_us),
+            heading.to_degrees(),
+            state(pose.state),
+            if status.mapping { "" } else { ", the map is frozen" },
+            pose.lines,
+            status.places,
+            status.scans,
+            f64::from(health.scan_us) * 1e-3,
+            f64::from(health.mapping_permille + health.link_permille) * 0.1,
+        );
+    }
+}
+
+fn seconds(us: u64) -> f64 {
+    us as f64 * 1e-6
+}
+
+fn print_hello(hello: &Hello) {
+    println!(
+        "robot '{}': lineslam {} on {}, up for {:.1} s, reset by {:?}, kept map {:?}; room for {} lines and {} places; {} beams",
+        hello.robot,
+        hello.firmware,
+        hello.board,
+        seconds(hello.uptime_us),
+        hello.reset,
+        hello.kept,
+        hello.lines,
+        hello.places,
+        hello.scanner.beams
+    );
+}
+
+fn state(state: State) -> &'static str {
+    match state {
+        State::Tracking => "tracking",
+        State::Uncertain => "uncertain",
+        State::Lost => "lost",
+    }
+}
+
+fn in_words(event: &Event) -> String {
+    match event {
+        Event::Started(cause) => format!("the board has started: {cause:?}"),
+        Event::SensorLost => "no scans: the robot goes on by odometry".into(),
+        Event::SensorFound => "scans again".into(),
+        Event::LoopClosed => "a loop was closed".into(),
+        Event::Wheels(Some(fault)) => format!("something is wrong with the wheels: {fault:?}"),
+        Event::Wheels(None) => "the wheels are as they should be again".into(),
+        Event::MapFull => "the map is full: old lines give way".into(),
+        Event::State(now) => format!("the robot is {}", state(*now)),
+        Event::CountersRestarted => "the wheels' counters began anew".into(),
+        Event::ScanRefused => "a scan was refused: another number of beams".into(),
+    }
+}
