@@ -20,7 +20,7 @@ use crate::robot;
 pub const ROOM: [usize; 2] = [1024, 256];
 /// … or less, on parts with 128 KiB of RAM.
 #[cfg(feature = "small")]
-pub const ROOM: [usize; 2] = [512, 96];
+pub const ROOM: [usize; 2] = [448, 96];
 /// Odometry samples there is room for: 0.32 s.
 pub const SAMPLES: usize = 64;
 
