@@ -16,6 +16,7 @@ mod kept;
 mod lidar;
 #[cfg(target_os = "none")]
 mod link;
+#[cfg(target_os = "none")]
 mod liveness;
 #[cfg(target_os = "none")]
 mod mapping;
