@@ -45,7 +45,7 @@ impl RateChoice {
     }
 
     /// A scan came, after so many that were dropped. `carrying` is the least rate that carries every scan, bit/s: for the sake of
-    /// scans none below is chosen. True where the rate falls, because more than half of a [`GROUP`] was dropped.
+    /// scans none below is chosen. True where the rate falls, because more than half of a group of scans was dropped.
     pub fn took(&mut self, dropped: u32, carrying: u32) -> bool {
         self.good += 1;
         self.dropped = self.dropped.saturating_add(dropped);
