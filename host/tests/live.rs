@@ -1,6 +1,7 @@
 //! `lineslam live` as a browser and a user meet it: what is served, who is refused, what a log tells, what commands do.
 
 mod live_bench;
+mod socket_robot;
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -494,4 +495,42 @@ fn the_address_is_printed_whoever_can_see_it_is_said_and_ctrl_c_ends_it() {
         assert_eq!(output.status.code(), Some(0), "{said}");
         assert_eq!(said.contains("there is no password"), is_open, "{said}");
     }
+}
+
+#[test]
+fn a_robot_is_shown_and_told_what_to_do() {
+    let (address, robot) = socket_robot::robot(0);
+    let source = lineslam::live::robot_source::start(address.parse().unwrap()).unwrap();
+    assert_eq!((source.about.kind, source.about.paced), (Kind::Robot, false));
+    assert!(source.about.subtitle.contains("robot 'paper', lineslam 0.1.0"), "{}", source.about.subtitle);
+    let served = Served::new(source);
+    let mut page = Page::open(served.address);
+    // A message of its lines was lost at first.
+    page.until_it(|page| page.lines.len() == 40 && page.path.len() > 20);
+    assert_eq!(page.lines[&8], [8.0, 0.0, 8.0, 2.5]);
+    assert_eq!(page.walls.values().filter(|wall| **wall).count(), 20);
+    assert!(page.path.iter().all(|(_, at)| *at == [0.5, -0.25]));
+    assert!(page.path.windows(2).all(|two| two[0].0 < two[1].0));
+    assert!(page.order(&json!({"command": "freeze"})).0);
+    let (done, words) = page.order(&json!({"command": "set_pose", "pose": [1e9, 0, 0]}));
+    assert!(!done && words.contains("a number makes no sense"), "{words}");
+    assert!(!page.order(&json!({"command": "pace", "speed": 2})).0, "a robot is not paced");
+    drop(page);
+    drop(served);
+    let requests = robot.join().unwrap();
+    let freezes = requests.iter().filter(|r| r.command == link::Command::SetMapping(false)).count();
+    assert_eq!(freezes, 1);
+}
+
+#[test]
+fn where_no_robot_answers_that_is_said() {
+    let (address, deaf) = socket_robot::robot(usize::MAX);
+    let output = Command::new(env!("CARGO_BIN_EXE_lineslam"))
+        .args(["live", "--no-open", "--listen", "127.0.0.1:0", "--port", &address])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("no answer from the robot within 4 s"), "{said}");
+    deaf.join().unwrap();
 }

@@ -4,8 +4,8 @@ use std::io::{IsTerminal, Write, stderr, stdin};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use lineslam::link::from_robot::{Cause, Event, Health, Hello, Outcome, Pose, State, Status};
-use lineslam::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams};
+use lineslam::link::from_robot::{Cause, Health, Hello, Pose, Status};
+use lineslam::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams, words};
 use lineslam::output::tum;
 use slam_core::geometry::pose::pose;
 
@@ -98,11 +98,9 @@ fn tell(address: &Address, ask: &Ask) -> anyhow::Result<()> {
 
 /// Has it done.
 fn order(client: &mut Client, command: Command) -> anyhow::Result<()> {
-    match client.request(command)? {
-        Outcome::Done => Ok(()),
-        Outcome::Unknown => bail!("{}: the robot's firmware does not know this", client.address()),
-        Outcome::OutOfRange => bail!("{}: the robot refuses: a number makes no sense", client.address()),
-        Outcome::NotConfigured => bail!("{}: the robot is not configured to do this", client.address()),
+    match words::of_refusal(client.request(command)?) {
+        None => Ok(()),
+        Some(why) => bail!("{}: {why}", client.address()),
     }
 }
 
@@ -210,7 +208,7 @@ impl Shown {
             _ if self.tum => {}
             FromRobot::Hello(hello) => print_hello(hello),
             FromRobot::Event(happened) => {
-                println!("{:9.1} s  {}", seconds(happened.at_us), in_words(&happened.event));
+                println!("{:9.1} s  {}", seconds(happened.at_us), words::of_event(&happened.event));
             }
             FromRobot::Status(status) => self.status = Some(status.clone()),
             FromRobot::Health(health) => self.line(health),
@@ -229,7 +227,7 @@ impl Shown {
             "{:9.1} s  x {x:.3} y {y:.3} m, {:.1}°, sure within {sigma_m:.3} m; {}{}; {} lines, {} places; {} scans; {:.1} ms a scan, cpu {:.1} %; lost {lost}",
             seconds(health.uptime_us),
             heading.to_degrees(),
-            state(pose.state),
+            words::of_state(pose.state),
             if status.mapping { "" } else { ", the map is frozen" },
             pose.lines,
             status.places,
@@ -257,27 +255,4 @@ fn print_hello(hello: &Hello) {
         hello.places,
         hello.scanner.beams
     );
-}
-
-fn state(state: State) -> &'static str {
-    match state {
-        State::Tracking => "tracking",
-        State::Uncertain => "uncertain",
-        State::Lost => "lost",
-    }
-}
-
-fn in_words(event: &Event) -> String {
-    match event {
-        Event::Started(cause) => format!("the board has started: {cause:?}"),
-        Event::SensorLost => "no scans: the robot goes on by odometry".into(),
-        Event::SensorFound => "scans again".into(),
-        Event::LoopClosed => "a loop was closed".into(),
-        Event::Wheels(Some(fault)) => format!("something is wrong with the wheels: {fault:?}"),
-        Event::Wheels(None) => "the wheels are as they should be again".into(),
-        Event::MapFull => "the map is full: old lines give way".into(),
-        Event::State(now) => format!("the robot is {}", state(*now)),
-        Event::CountersRestarted => "the wheels' counters began anew".into(),
-        Event::ScanRefused => "a scan was refused: another number of beams".into(),
-    }
 }

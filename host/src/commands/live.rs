@@ -4,7 +4,9 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use lineslam::link::{Address, LinkError};
 use lineslam::live::log_source::LogSource;
+use lineslam::live::robot_source;
 use lineslam::live::server::{Options, PORT, Server};
 use lineslam::map_file::{MapFile, MapFileError};
 use lineslam::replay::Start;
@@ -16,7 +18,7 @@ use super::common::Configuration;
 use super::log_args::{ReadArgs, warn};
 
 #[derive(clap::Args)]
-#[command(group(clap::ArgGroup::new("source").required(true).args(["log", "simulate"])))]
+#[command(group(clap::ArgGroup::new("source").required(true).args(["log", "simulate", "port"])))]
 pub struct Args {
     /// The log: a ROS bag (.bag, .mcap, .db3 or its folder), a CARMEN or mines log or JSON lines, these plain or gzipped.
     log: Option<PathBuf>,
@@ -25,6 +27,10 @@ pub struct Args {
     /// Instead of a log: drive a simulated robot through this world, whose true walls are shown beneath the map.
     #[arg(long, value_name = "WORLD")]
     simulate: Option<PathBuf>,
+    /// Instead of a log: a robot. Its port, such as /dev/ttyACM0, or tcp://HOST:PORT of `cargo xtask emulate --vcp PORT`; without a value
+    /// that of the ST-LINK that is plugged in.
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "auto", conflicts_with_all = ["robot", "config", "map", "speed"])]
+    port: Option<String>,
     /// Seed of the simulated drive.
     #[arg(long, default_value_t = 1, requires = "simulate")]
     seed: u64,
@@ -82,11 +88,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     // The port first: a large log takes a while to read.
     let server = Server::bind(&Options { listen: args.listen, names: args.names.clone() })?;
-    let source = match &args.simulate {
-        Some(world) => simulated(world, args)?,
-        None => recorded(args.log.as_deref().context("no log")?, args)?,
+    let source = match (&args.port, &args.simulate) {
+        (Some(port), _) => robot_source::start(address(port)?)?,
+        (None, Some(world)) => simulated(world, args)?.start()?,
+        (None, None) => recorded(args.log.as_deref().context("no log")?, args)?.start()?,
     };
-    let source = source.start()?;
     let url = server.url();
     println!("{url}");
     if server.is_open() {
@@ -109,6 +115,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
     })?;
     Ok(())
+}
+
+fn address(port: &str) -> Result<Address, LinkError> {
+    if port == "auto" { Address::find() } else { port.parse() }
 }
 
 fn start(args: &Args) -> anyhow::Result<Start> {

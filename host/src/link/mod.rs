@@ -10,6 +10,7 @@
 
 mod address;
 mod map_copy;
+pub mod words;
 
 use std::collections::VecDeque;
 use std::hash::{BuildHasher, Hasher, RandomState};

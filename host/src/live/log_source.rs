@@ -18,7 +18,7 @@ use super::source::{
     About, Closed, Feed, Kind, Line, Note, PathPoint, Places, Playback, Pose, Scan, Source, Weight, What,
     channel,
 };
-use super::status::Status;
+use super::status::{Status, Troubles};
 use crate::configuration::Configuration;
 use crate::log::Log;
 use crate::replay::{MAP_SEGMENTS, MOST_BEAMS, ReplayError, Run, Start, Taken};
@@ -121,7 +121,7 @@ struct Told {
     places: Places,
     status_us: Option<u64>,
     state: TrackingState,
-    troubles: Vec<String>,
+    troubles: Troubles,
 }
 
 /// One pass through the log.
@@ -337,13 +337,9 @@ impl<'a> Player<'a> {
             return Ok(());
         }
         let status = self.status(&taken.update, taken.took);
-        let troubles = status.troubles();
-        for trouble in &troubles {
-            if !self.told.troubles.contains(&trouble.remedy.to_owned()) {
-                self.note(trouble.weight, trouble.what.clone())?;
-            }
+        for trouble in self.told.troubles.new_in(&status) {
+            self.note(trouble.weight, trouble.what)?;
         }
-        self.told.troubles = troubles.iter().map(|trouble| trouble.remedy.to_owned()).collect();
         if state == TrackingState::Tracking && self.told.state != state {
             self.note(Weight::Info, "The robot knows where it is.")?;
         }
@@ -357,7 +353,7 @@ impl<'a> Player<'a> {
         Status {
             state: slam.state(),
             mapping: slam.is_mapping(),
-            support: update.support,
+            support: Some(update.support),
             scans_per_s: self.scans_per_s,
             scan_us: took.as_micros().try_into().unwrap_or(u32::MAX),
             way_m: slam.way_m(),

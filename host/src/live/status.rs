@@ -35,8 +35,8 @@ pub struct Status {
     pub state: TrackingState,
     /// Whether the map learns.
     pub mapping: bool,
-    /// Share of the last scan that the map explains.
-    pub support: f32,
+    /// Share of the last scan that the map explains, where it is known.
+    pub support: Option<f32>,
     /// Scans a second, by their stamps.
     pub scans_per_s: f32,
     /// Time that a scan takes where the core runs, microseconds.
@@ -83,6 +83,20 @@ pub struct Trouble {
     pub remedy: &'static str,
 }
 
+/// Troubles that have been told, so that each is told once while it lasts.
+#[derive(Clone, Debug, Default)]
+pub struct Troubles(Vec<&'static str>);
+
+impl Troubles {
+    /// Those that have not been told yet.
+    pub fn new_in(&mut self, status: &Status) -> Vec<Trouble> {
+        let troubles = status.troubles();
+        let now: Vec<&'static str> = troubles.iter().map(|trouble| trouble.remedy).collect();
+        let told = std::mem::replace(&mut self.0, now);
+        troubles.into_iter().filter(|trouble| !told.contains(&trouble.remedy)).collect()
+    }
+}
+
 /// A counter that is not zero.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Counted {
@@ -100,7 +114,6 @@ impl Status {
         let of = |[count, room]: [u32; 2]| format!("{count} of {room}");
         let mut facts = vec![
             Fact { name: "Driven", value: format!("{:.1} m", self.way_m) },
-            Fact { name: "Scan explained", value: format!("{:.0} %", 100.0 * self.support) },
             Fact { name: "Scans", value: format!("{:.1} per second", self.scans_per_s) },
             Fact { name: "Time for a scan", value: milliseconds(self.scan_us) },
             Fact { name: "Map lines", value: of(self.lines) },
@@ -108,6 +121,9 @@ impl Status {
             Fact { name: "Loops closed", value: self.core.loops_closed.to_string() },
             Fact { name: "Map", value: if self.mapping { "learns" } else { "frozen" }.into() },
         ];
+        if let Some(support) = self.support {
+            facts.insert(1, Fact { name: "Scan explained", value: format!("{:.0} %", 100.0 * support) });
+        }
         if let Some(delay) = self.delay.filter(|delay| delay.used) {
             facts.push(Fact {
                 name: "Scans stamped late by",
@@ -254,7 +270,7 @@ mod tests {
         Status {
             state: TrackingState::Tracking,
             mapping: true,
-            support: 0.97,
+            support: Some(0.97),
             scans_per_s: 10.0,
             scan_us: 412,
             way_m: 12.34,
