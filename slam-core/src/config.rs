@@ -253,7 +253,7 @@ impl Default for SlamConfig {
             state: STATE,
             relocalisation: Some(RelocalisationConfig {
                 places_per_scan: 1,
-                hypotheses_per_scan: 10,
+                hypotheses_per_scan: 9,
                 least_segments: 3,
                 least_support: 0.45,
                 min_support: 0.7,
