@@ -17,7 +17,7 @@ use crate::robot;
 
 /// Map segments and places there is room for: a whole floor …
 #[cfg(not(feature = "small"))]
-pub const ROOM: [usize; 2] = [1024, 256];
+pub const ROOM: [usize; 2] = [slam_core::capacity::SEGMENTS, slam_core::capacity::PLACES];
 /// … or less, on parts with 128 KiB of RAM.
 #[cfg(feature = "small")]
 pub const ROOM: [usize; 2] = [448, 96];

@@ -2,6 +2,8 @@
 //!
 //! Everything urgent runs above this in interrupts: a long update delays no byte and no tick.
 
+mod reports;
+
 use core::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use ::link::from_robot::{Cause, Event as News};
@@ -9,35 +11,29 @@ use embassy_futures::select::{Either4, select4};
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::zerocopy_channel::Receiver;
 use embassy_time::{Duration, Instant, Ticker, Timer};
-use slam_core::Segment;
 use slam_core::geometry::pose::components;
 use slam_core::odometry::wheel_faults::WheelFault;
 use slam_core::tracking::TrackingState;
 
-use crate::board::{CORE_HZ, supply};
+use crate::board::supply;
 use crate::encoders;
 use crate::kept::{Found, Keeper, Mapper};
-use crate::lidar::{self, STATE, ScanBuffer};
-use crate::link::{Incoming, Load, Outbox, REQUESTS, Restart, View, fault_of, pose_of, state_of};
+use crate::lidar::ScanBuffer;
+use crate::link::{Incoming, Load, Outbox, REQUESTS, Restart, View, pose_of};
 use crate::liveness::{self, Task};
 use crate::measure::{self, ScanCycles};
-use crate::resets::Count;
 use crate::trace::{Event, Tracer, sigma};
-use crate::{rtt, stack};
+use reports::STATUS_EVERY;
 
 /// Without a scan the map moves on by odometry so often …
 const COAST_EVERY: Duration = Duration::from_millis(50);
 /// … to so long ago: the longest that a scan may be on its way from its middle beam. That is 122 ms at 250 kbit/s and 222 ms at
 /// 115 200 bit/s, the least rate that the driver falls back to: 33 ms of sweep, 3 ms of the sensor's work, and its bytes.
 const COAST_BEHIND_US: u64 = 230_000;
-/// The status is logged so often.
-const STATUS_EVERY: Duration = Duration::from_secs(1);
 /// A scan is held for so long at the most while it is sent.
 const HOLD: Duration = Duration::from_millis(60);
 /// Between the record's last event and a request's so much passes, for whoever reads the record.
 const RECORD_READ: Duration = Duration::from_millis(2);
-/// Segments of the map that are printed at once.
-const PRINT_AT_ONCE: usize = 8;
 
 /// The [`TrackingState`], for the LED.
 pub static TRACKING: AtomicU8 = AtomicU8::new(TrackingState::Tracking as u8);
@@ -87,8 +83,9 @@ pub async fn run(
                 mapping.outbox.look_at_map();
             }
             Either4::Third(()) => {}
+            // One that comes while the supply is low is dropped, and the PC asks again.
             Either4::Fourth(request) => {
-                if mapping.obey(request) {
+                if mapping.may_work() && mapping.obey(request) {
                     Timer::after(RECORD_READ).await;
                 }
             }
@@ -97,7 +94,9 @@ pub async fn run(
             scans.receive_done();
         }
         mapping.report();
-        mapping.forget_map();
+        if mapping.forget_map() {
+            Timer::after(RECORD_READ).await;
+        }
         mapping.print_map();
     }
 }
@@ -169,8 +168,7 @@ impl Mapping {
             defmt::warn!("the reset came in the middle of a scan; what was whole of the map is there");
             (Event::Recovered, Cause::Recovered)
         };
-        self.tracer.event(event, 0, &[], self.keeper.mapper(), 0);
-        self.tell(cause, 0, 0);
+        self.record(event, cause, 0, &[], 0);
         let pose = components(&self.keeper.mapper().slam().pose());
         defmt::info!(
             "the map of {=usize} segments is kept; last seen at x {=f32} m, y {=f32} m, heading {=f32} rad",
@@ -207,8 +205,7 @@ impl Mapping {
         let took_us = begin.elapsed().as_micros() as u32;
         self.last_took_us = took_us;
         self.busy_us += u64::from(took_us);
-        self.tracer.event(Event::Scan, scan.middle_us, ranges_mm, self.keeper.mapper(), took_us);
-        self.tell(Cause::Scan, scan.middle_us, took_us);
+        self.record(Event::Scan, Cause::Scan, scan.middle_us, ranges_mm, took_us);
         self.outbox.scan(self.tracer.events());
         self.held = Some(begin);
         self.load.scan_us = took_us;
@@ -241,6 +238,12 @@ impl Mapping {
         self.report_tracking();
     }
 
+    /// Something was done to the map: the record has it, and a PC is told.
+    fn record(&mut self, event: Event, cause: Cause, at_us: u64, ranges_mm: &[u16], took_us: u32) {
+        self.tracer.event(event, at_us, ranges_mm, self.keeper.mapper(), took_us);
+        self.tell(cause, at_us, took_us);
+    }
+
     /// Tells a PC of the event that the record has got.
     fn tell(&mut self, cause: Cause, at_us: u64, took_us: u32) {
         self.recorded = Instant::now();
@@ -254,23 +257,28 @@ impl Mapping {
         let Some(cause) = outbox.obey(incoming, tracer.samples_taken(), keeper, restart) else {
             return false;
         };
+        self.was_changed(cause);
+        true
+    }
+
+    /// The map, or how it is used, was changed by what somebody asked for.
+    fn was_changed(&mut self, cause: Cause) {
+        let now_us = Instant::now().as_micros();
         let event = match cause {
-            Cause::Forgotten => Event::Forgotten,
             Cause::PoseSet(to) => {
                 let [x, y, heading] = to.map(|v| [v.to_bits() as u16, (v.to_bits() >> 16) as u16]);
                 self.set_pose = [x[0], x[1], y[0], y[1], heading[0], heading[1]];
-                Event::PoseSet
+                self.tracer.event(Event::PoseSet, now_us, &self.set_pose, self.keeper.mapper(), 0);
+                self.tell(cause, now_us, 0);
+                return self.report_tracking();
             }
+            Cause::Forgotten => Event::Forgotten,
             Cause::Frozen => Event::Frozen,
             Cause::Unfrozen => Event::Unfrozen,
             _ => Event::Relocalising,
         };
-        let now_us = Instant::now().as_micros();
-        let given: &[u16] = if event == Event::PoseSet { &self.set_pose } else { &[] };
-        self.tracer.event(event, now_us, given, self.keeper.mapper(), 0);
-        self.tell(cause, now_us, 0);
+        self.record(event, cause, now_us, &[], 0);
         self.report_tracking();
-        true
     }
 
     /// Sends what there is room for. Whether the scan that is held is needed no longer.
@@ -287,35 +295,6 @@ impl Mapping {
         self.held.is_some() && !self.outbox.is_sending() && self.held.take().is_some()
     }
 
-    /// What has changed of the state, and of what is known of the wheels.
-    fn report_tracking(&mut self) {
-        let mapper = self.keeper.mapper();
-        let (state, fault) = (mapper.slam().state(), mapper.slam().wheel_fault());
-        let restarts = mapper.counters().counters_restarted;
-        if core::mem::replace(&mut self.state, state) != state {
-            TRACKING.store(state as u8, Ordering::Relaxed);
-            self.outbox.event(News::State(state_of(state)));
-            match state {
-                TrackingState::Tracking => defmt::info!("tracking again"),
-                TrackingState::Uncertain => defmt::warn!("the pose is uncertain"),
-                TrackingState::Lost => {
-                    defmt::warn!("the robot is lost and looks for itself: nothing enters the map")
-                }
-            }
-        }
-        if core::mem::replace(&mut self.fault, fault) != fault {
-            self.outbox.event(News::Wheels(fault.map(fault_of)));
-            match fault {
-                Some(fault) => defmt::warn!("{=str}", fault.message()),
-                None => defmt::info!("the wheels are as they should be again"),
-            }
-        }
-        if core::mem::replace(&mut self.restarts, restarts) != restarts {
-            defmt::warn!("the counters restarted");
-            self.outbox.event(News::CountersRestarted);
-        }
-    }
-
     fn coast(&mut self) {
         let until_us = Instant::now().as_micros().saturating_sub(COAST_BEHIND_US);
         let late = self.keeper.mapper().pose_us().is_none_or(|at| at < until_us);
@@ -328,137 +307,32 @@ impl Mapping {
             take_samples(mapper, tracer);
             mapper.coast(until_us)
         });
-        self.tracer.event(Event::Coasted, until_us, &[], self.keeper.mapper(), 0);
-        self.tell(Cause::Coasted, until_us, 0);
+        self.record(Event::Coasted, Cause::Coasted, until_us, &[], 0);
         if moved.is_some() && !core::mem::replace(&mut self.coasting, true) {
             self.outbox.event(News::SensorLost);
             defmt::warn!("no scans; going on by odometry alone");
         }
     }
 
-    /// The status line, once a second, and what was dropped.
-    fn report(&mut self) {
-        let dropped = encoders::DROPPED.load(Ordering::Relaxed);
-        if core::mem::replace(&mut self.dropped, dropped) != dropped {
-            defmt::warn!("encoders: {=u32} samples dropped so far", dropped);
-        }
-        let now = Instant::now();
-        if now < self.next_status {
-            return;
-        }
-        let period_us = (STATUS_EVERY + (now - self.next_status)).as_micros();
-        self.next_status = now + STATUS_EVERY;
-        let mapper = self.keeper.mapper();
-        let slam = mapper.slam();
-        let (delay_s, delay_sigma_s, delay_used) =
-            mapper.delay().map_or((0.0, 0.0, false), |delay| (delay.delay_s, delay.sigma_s, delay.used));
-        let (pose, covariance) = (components(&slam.pose()), slam.covariance());
-        let scans = STATE.scans.load(Ordering::Relaxed);
-        let new = scans.wrapping_sub(core::mem::replace(&mut self.scans_at_status, scans));
-        let permille = core::mem::take(&mut self.busy_us) * 1000 / period_us.max(1);
-        self.load.mapping_permille = permille as u16;
-        self.load.link_permille = (core::mem::take(&mut self.link_us) * 1000 / period_us.max(1)) as u16;
-        let counters = slam.map().counters();
-        let full = counters.evicted.saturating_add(counters.refused);
-        if core::mem::replace(&mut self.full, full) < full {
-            self.outbox.event(News::MapFull);
-        }
-        self.outbox.second();
-        defmt::info!(
-            "x {=f32} y {=f32} heading {=f32}, sigma {=f32} {=f32} {=f32}, {=usize} segments, {=u32} scans in {=u64} ms, \
-             update {=u32} us, cpu {=u64} permille, delay {=f32} s, sigma {=f32} s, used {=bool}",
-            pose.x,
-            pose.y,
-            pose.z,
-            sigma(covariance.m11),
-            sigma(covariance.m22),
-            sigma(covariance.m33),
-            slam.map().segments().len(),
-            new,
-            period_us / 1000,
-            self.last_took_us,
-            permille,
-            delay_s,
-            delay_sigma_s,
-            delay_used
-        );
-        defmt::info!(
-            "lidar: missed {=u32}, dropped {=u32}, port errors {=u32}, losses {=u32}; {}; {}",
-            STATE.missed.load(Ordering::Relaxed),
-            STATE.dropped.load(Ordering::Relaxed),
-            STATE.port_errors.load(Ordering::Relaxed),
-            STATE.losses.load(Ordering::Relaxed),
-            slam.counters(),
-            mapper.counters()
-        );
-        let [median, most] = self.scan_cycles.take();
-        let urgent_permille =
-            u64::from(measure::take_urgent()) * 1_000_000_000 / u64::from(CORE_HZ) / period_us.max(1);
-        defmt::info!(
-            "health: scan {=u32} cycles at the median, {=u32} at most; urgent executor {=u64} permille; supply dips {=u32}; \
-             log frames lost {=u32}; since power-up: watchdog {=u32}, failures {=u32}, clock lost {=u32}",
-            median,
-            most,
-            urgent_permille,
-            supply::dips(),
-            rtt::lost(),
-            Count::Watchdog.read(),
-            Count::Failure.read(),
-            Count::ClockLost.read()
-        );
-        lidar::report();
-        defmt::info!(
-            "stack: {=u32} bytes at most, {=u32} in thread mode, {=u32} in the urgent executor",
-            stack::most(),
-            stack::most_in_thread(),
-            stack::most_in_interrupts()
-        );
-    }
-
-    /// Begins a new map where the button asks for it.
-    fn forget_map(&mut self) {
-        if !FORGET_MAP.load(Ordering::Relaxed) || !self.may_work() {
-            return;
+    /// Begins a new map where the button asks for it, once whoever reads the record has had its last event. Whether it did.
+    fn forget_map(&mut self) -> bool {
+        let is_read = Instant::now() >= self.recorded + RECORD_READ;
+        if !FORGET_MAP.load(Ordering::Relaxed) || !is_read || !self.may_work() {
+            return false;
         }
         FORGET_MAP.store(false, Ordering::Relaxed);
         self.printing = None;
         match self.keeper.forget() {
-            Ok(()) => defmt::warn!("the map is forgotten, as the button asks; a new one begins"),
-            Err(error) => defmt::error!("the configuration cannot be used: {}", error),
+            Ok(()) => {
+                defmt::warn!("the map is forgotten, as the button asks; a new one begins");
+                self.was_changed(Cause::Forgotten);
+                true
+            }
+            Err(error) => {
+                defmt::error!("the configuration cannot be used: {}", error);
+                false
+            }
         }
-        self.tracer.event(Event::Forgotten, 0, &[], self.keeper.mapper(), 0);
-        self.tell(Cause::Forgotten, 0, 0);
-    }
-
-    /// A few segments of the map that was asked for, so that the log keeps up.
-    fn print_map(&mut self) {
-        if PRINT_MAP.swap(false, Ordering::Relaxed) {
-            defmt::info!("walls of the map");
-            self.printing = Some(0);
-        }
-        let Some(from) = self.printing else { return };
-        let slam = self.keeper.mapper().slam();
-        let map = slam.map().segments();
-        let next_few = map.iter().enumerate().skip(from).take(PRINT_AT_ONCE);
-        for (_, entry) in next_few.filter(|(index, _)| slam.is_wall(*index)) {
-            let Segment { start: a, end: b, moments, .. } = entry.segment();
-            defmt::info!(
-                "segment {=f32} {=f32} {=f32} {=f32} points {=u32} scans {=u16}",
-                a.x,
-                a.y,
-                b.x,
-                b.y,
-                moments.inliers,
-                entry.hits
-            );
-        }
-        let next = from + PRINT_AT_ONCE;
-        self.printing = if next < map.len() {
-            Some(next)
-        } else {
-            defmt::info!("end of map");
-            None
-        };
     }
 }
 

@@ -2,7 +2,6 @@
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
-use crate::board;
 use crate::liveness::Task;
 
 /// In the upper half where the word is an order and not what power-up left.
@@ -13,7 +12,7 @@ const MAGIC: u32 = 0x4F52 << 16;
 #[unsafe(link_section = ".uninit.ORDER")]
 static ORDER: AtomicU32 = AtomicU32::new(0);
 
-/// Encoders, lidar and mapping wait for ever, by the number of their [`Task`]; the link waits for an interrupt that is lost.
+/// A task waits for ever, by the number of its [`Task`].
 const HANG: u32 = 1;
 /// The task of the encoders never gives its executor back.
 const SPIN_IN_ENCODERS: u32 = 5;
@@ -36,7 +35,7 @@ fn taken(order: u32) -> bool {
 
 /// What a task does when it comes by.
 pub async fn obey(task: Task) {
-    if task != Task::Link && taken(HANG + task as u32) {
+    if taken(HANG + task as u32) {
         core::future::pending::<()>().await;
     }
     let spins = match task {
@@ -53,9 +52,6 @@ pub async fn obey(task: Task) {
 
 /// What is done once the watchdog has been looked after.
 pub fn obey_in_thread_mode() {
-    if taken(HANG + Task::Link as u32) {
-        board::silence_link();
-    }
     if taken(PANIC_IN_LOG) {
         defmt::info!("{}", Fails { by_fault: false });
     }

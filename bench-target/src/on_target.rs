@@ -7,6 +7,7 @@ use cortex_m::peripheral::DWT;
 use defmt_rtt as _;
 use nalgebra::{Point2, Vector2};
 use panic_probe as _;
+use slam_core::capacity::{PLACES, SEGMENTS};
 use slam_core::geometry::pose::pose;
 use slam_core::geometry::segment::Moments;
 use slam_core::odometry::Increment;
@@ -25,9 +26,6 @@ struct Motion {
 
 include!(concat!(env!("OUT_DIR"), "/set.rs"));
 
-/// Room for segments and places: that of the firmware.
-const CAPACITY: usize = 1024;
-const PLACES: usize = 256;
 /// The URG-04LX's.
 const BEAMS: usize = 682;
 /// Segments known at the start of a run.
@@ -82,7 +80,7 @@ enum Trouble {
 
 /// The fixed set of scans through the core, with so many segments known.
 fn run(name: &str, config: SlamConfig, known: usize, trouble: Trouble) {
-    static mut SLAM: MaybeUninit<Slam<CAPACITY, BEAMS, PLACES>> = MaybeUninit::uninit();
+    static mut SLAM: MaybeUninit<Slam<SEGMENTS, BEAMS, PLACES>> = MaybeUninit::uninit();
     // SAFETY: called from the only thread there is, and never from within itself.
     let place = unsafe { &mut *core::ptr::addr_of_mut!(SLAM) };
     let Ok(slam) = Slam::new_in(place, config) else {

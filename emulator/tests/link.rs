@@ -62,7 +62,10 @@ fn all_that_is_subscribed_to_is_what_the_firmware_did_bit_for_bit() {
     let (outcome, judged) = hall_with(everything(), Some(60), &[]);
     assert!(nothing_lost(&outcome) && judged.report.scans_sent - judged.report.scans_used <= 1);
     let FromRobot::Hello(hello) = &messages(&outcome.vcp)[0] else { panic!("who is there comes first") };
-    assert_eq!((hello.robot.as_str(), hello.lines, hello.reset), ("paper", 512, ResetCause::Power));
+    assert_eq!(
+        (hello.robot.as_str(), hello.lines, hello.reset),
+        ("paper", slam_core::capacity::SEGMENTS as u16, ResetCause::Power)
+    );
     // Every event of the record, in order; the last may still be on its way.
     let said: Vec<_> = poses(&outcome.vcp).map(|pose| bits_of_pose(&pose)).collect();
     let done: Vec<_> = outcome.entries.iter().map(bits_of).collect();

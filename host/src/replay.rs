@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use nalgebra::Isometry2;
 pub use run::{Run, Taken};
+use slam_core::capacity::{PLACES, SEGMENTS};
 use slam_core::config::ConfigError;
 use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::delay::Delay;
@@ -18,9 +19,6 @@ use crate::log::Log;
 use crate::map_file::{MapFile, MapFileError};
 use crate::robot::Robot;
 
-/// Map segments and places of the replayed `Slam`: what the firmware has.
-pub const MAP_SEGMENTS: usize = 1024;
-const PLACES: usize = 256;
 /// Map segments seen in fewer scans are not yet sure: drawn thin, and not judged.
 pub const ESTABLISHED_HITS: u16 = 3;
 /// Beams of the replayed `Slam` for a URG-04LX, for what has more, and at the most.
@@ -189,7 +187,7 @@ fn run_sized<const BEAMS: usize>(
         local_map: slam.map().segments().to_vec(),
         map_counters: slam.map().counters(),
         counters: slam.counters(),
-        slam_bytes: Slam::<MAP_SEGMENTS, BEAMS, PLACES>::BYTES,
+        slam_bytes: Slam::<SEGMENTS, BEAMS, PLACES>::BYTES,
         config: *run.config(),
         distance_m,
         impossible_steps: mapper.counters().impossible_steps as usize,

@@ -791,7 +791,7 @@ fn maps_that_are_none_are_refused() {
         (good.replace("\"points\"", "\"dots\""), &["map.json", "dots"]),
         (good.replace("]}", ""), &["map.json", "EOF"]),
         (String::new(), &["map.json", "EOF"]),
-        (whole.replace("LINE", &[line; 513].join(",")), &["map.json", "513 lines", "512"]),
+        (whole.replace("LINE", &[line; 1025].join(",")), &["map.json", "1025 lines", "1024"]),
     ] {
         let map = bench.file("map.json", content);
         bench.refuses(&log, &["--map", map.to_str().unwrap()], words);

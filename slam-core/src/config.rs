@@ -253,7 +253,8 @@ impl Default for SlamConfig {
             state: STATE,
             relocalisation: Some(RelocalisationConfig {
                 places_per_scan: 1,
-                hypotheses_per_scan: 9,
+                hypotheses_per_scan: 10,
+                poses_per_scan: 13,
                 least_segments: 3,
                 least_support: 0.45,
                 min_support: 0.7,

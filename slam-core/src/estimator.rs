@@ -3,10 +3,9 @@
 //! In: motions by the odometry, the pose that tracking finds, segments and pairs of a scan. Out: the pose of `base` in `map` with
 //! its covariance, and a map that is moved with it.
 //!
-//! Scan by scan the pose is tracked among lines that stand still; the local covariance is its own error among them. Of
-//! [`keyframe`](crate::ekf::keyframe)s an extended Kalman filter, [`EkfSlam`], takes in what was seen, a few lines with
-//! each scan, and gathers in its error state what they say of pose, odometry and lines. [`Estimator::commit`] injects the error
-//! state: pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
+//! Scan by scan the pose is tracked among lines that stand still; the local covariance is its own error among them. Of [`keyframe`](crate::ekf::keyframe)s
+//! an extended Kalman filter, [`EkfSlam`], takes in what was seen, a few lines with each scan, and gathers in its error state what they say. By
+//! [`Estimator::commit`] pose and lines move at once. With the paper's registration there is no filter, and the pose is only tracked.
 
 mod recovery;
 mod upkeep;

@@ -72,6 +72,7 @@
 #[cfg(test)]
 extern crate std;
 
+pub mod capacity;
 pub mod config;
 pub mod ekf;
 mod estimator;

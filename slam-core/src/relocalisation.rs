@@ -38,6 +38,8 @@ pub struct RelocalisationConfig {
     pub places_per_scan: u8,
     /// Hypotheses that are looked at with each scan; they take turns.
     pub hypotheses_per_scan: u8,
+    /// Poses that are refined in the map with each scan, these and those that places propose.
+    pub poses_per_scan: u8,
     /// Scans with fewer segments say nothing.
     pub least_segments: u8,
     /// A pose stays a hypothesis as long as it explains this share of the scans, …
@@ -64,6 +66,7 @@ impl RelocalisationConfig {
     pub(crate) fn validate(&self) -> Checked {
         check("relocalisation.places_per_scan", self.places_per_scan > 0)?;
         check("relocalisation.hypotheses_per_scan", self.hypotheses_per_scan > 0)?;
+        check("relocalisation.poses_per_scan", self.poses_per_scan > self.hypotheses_per_scan)?;
         let fields = [
             ("relocalisation.least_support", self.least_support),
             ("relocalisation.min_support", self.min_support),
@@ -185,8 +188,9 @@ impl Relocaliser {
         self.go_on(evidence.motion, predicted);
         let says_something = evidence.scene.observed.len() >= usize::from(config.least_segments);
         if says_something {
-            self.hold_hypotheses(evidence, tracker, config, watch);
-            self.ask_places(evidence, tracker, config, watch);
+            let held = self.hold_hypotheses(evidence, tracker, config, watch);
+            let most = usize::from(config.poses_per_scan).saturating_sub(held);
+            self.ask_places(evidence, tracker, config, most, watch);
             self.merge();
         }
         let complete = usize::from(self.asked) >= evidence.places.anchors().len();
@@ -209,16 +213,17 @@ impl Relocaliser {
         }
     }
 
-    /// Holds the scan against those of the hypotheses whose turn it is.
+    /// Holds the scan against those of the hypotheses whose turn it is. How many they are.
     fn hold_hypotheses<const N: usize, const P: usize>(
         &mut self,
         evidence: &Evidence<'_, P>,
         tracker: &mut Tracker<N>,
         config: &RelocalisationConfig,
         watch: &mut impl FnMut(Stage),
-    ) {
+    ) -> usize {
         let count = self.hypotheses.len();
-        for _ in 0..count.min(config.hypotheses_per_scan.into()) {
+        let held = count.min(config.hypotheses_per_scan.into());
+        for _ in 0..held {
             let index = usize::from(self.next) % count;
             self.next = (index + 1) as u8;
             if let Some(candidate) = self.hypotheses.get_mut(index)
@@ -229,14 +234,16 @@ impl Relocaliser {
             }
         }
         self.hypotheses.retain(|candidate| candidate.scans == 0 || candidate.support >= config.least_support);
+        held
     }
 
-    /// Compares the scan with the next places.
+    /// Compares the scan with the next places, and refines the best `most` of what they propose.
     fn ask_places<const N: usize, const P: usize>(
         &mut self,
         evidence: &Evidence<'_, P>,
         tracker: &mut Tracker<N>,
         config: &RelocalisationConfig,
+        mut most: usize,
         watch: &mut impl FnMut(Stage),
     ) {
         let seen = of_scan(evidence.scene.observed);
@@ -245,7 +252,9 @@ impl Relocaliser {
             let place = places - 1 - usize::from(self.asked) % places;
             self.asked = self.asked.saturating_add(1);
             let (map, sensor) = (evidence.scene.map, &evidence.scene.config.sensor);
-            for pose in evidence.places.poses_of(place, &seen, map, sensor.reach_m()) {
+            let poses = evidence.places.poses_of(place, &seen, map, sensor.reach_m());
+            for pose in poses.into_iter().take(most) {
+                most -= 1;
                 let proposed = Prior { pose, covariance: diagonal(PROPOSED) };
                 if let Some((hypothesis, support)) = held_against(evidence, &proposed, tracker, watch)
                     && support >= config.least_support

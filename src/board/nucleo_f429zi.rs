@@ -257,9 +257,3 @@ impl VcpPins {
         Some((tx, rx.into_ring_buffered(BUFFER.init([0; VCP_RING]))))
     }
 }
-
-/// For tests: what the link's port has sent is never told, as if an interrupt were lost.
-#[cfg(feature = "misbehaves")]
-pub fn silence_link() {
-    interrupt::DMA1_STREAM3.disable();
-}

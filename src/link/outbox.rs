@@ -121,11 +121,9 @@ impl Outbox {
         }
     }
 
-    /// A scan was taken in, the event of this number. Whether it is to be held until [`Self::is_sending`] is over.
-    pub fn scan(&mut self, number: u32) -> bool {
-        let wanted = self.streams.has(Streams::SCANS);
-        self.sending = wanted.then_some(Sending { number, next: 0 });
-        wanted
+    /// A scan was taken in, the event of this number. It is to be held until [`Self::is_sending`] is over.
+    pub fn scan(&mut self, number: u32) {
+        self.sending = self.streams.has(Streams::SCANS).then_some(Sending { number, next: 0 });
     }
 
     /// Whether a scan is on its way out.

@@ -8,14 +8,12 @@ use lineslam::link::{Address, LinkError};
 use lineslam::live::log_source::LogSource;
 use lineslam::live::robot_source;
 use lineslam::live::server::{Options, PORT, Server};
-use lineslam::map_file::{MapFile, MapFileError};
-use lineslam::replay::Start;
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
 use lineslam::sim::{self, SimConfig, judge};
 
-use super::common::Configuration;
 use super::log_args::{ReadArgs, warn};
+use super::start_args::StartArgs;
 
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("source").required(true).args(["log", "simulate", "port"])))]
@@ -37,18 +35,8 @@ pub struct Args {
     /// Change an error of the simulated robot, or have something happen to it; `lineslam simulate --help` has all keys.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "simulate")]
     settings: Vec<String>,
-    /// Robot file, as for replay and simulate.
-    #[arg(long, value_name = "FILE")]
-    robot: Option<PathBuf>,
-    /// Which algorithm.
-    #[arg(long, value_enum, default_value_t = Configuration::Default)]
-    config: Configuration,
-    /// Begin in this map, a map.json of replay, and go on mapping. Where the robot stands in it is looked for.
-    #[arg(long, value_name = "FILE")]
-    map: Option<PathBuf>,
-    /// Only find the way in the map: it stays as it is.
-    #[arg(long, requires = "map")]
-    localise: bool,
+    #[command(flatten)]
+    begin: StartArgs,
     /// Times as fast as it was recorded; 0 begins paused, `max` goes as fast as it can. The page can change it.
     #[arg(long, value_name = "TIMES", default_value = "1", value_parser = speed)]
     speed: Speed,
@@ -83,9 +71,7 @@ fn listen(text: &str) -> Result<SocketAddr, String> {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    if args.map.is_some() && args.config != Configuration::Default {
-        return Err(MapFileError::Configuration(args.config.name()).into());
-    }
+    args.begin.check()?;
     // The port first: a large log takes a while to read.
     let server = Server::bind(&Options { listen: args.listen, names: args.names.clone() })?;
     let source = match (&args.port, &args.simulate) {
@@ -121,13 +107,8 @@ fn address(port: &str) -> Result<Address, LinkError> {
     if port == "auto" { Address::find() } else { port.parse() }
 }
 
-fn start(args: &Args) -> anyhow::Result<Start> {
-    let map = args.map.as_deref().map(MapFile::load).transpose()?;
-    Ok(Start { map, pose: None, frozen: args.localise })
-}
-
 fn recorded(path: &Path, args: &Args) -> anyhow::Result<LogSource> {
-    let given = args.robot.as_deref().map(Robot::load).transpose()?;
+    let given = args.begin.robot()?;
     let wheels = given.as_ref().is_some_and(|robot| robot.wheels.is_some());
     let log = args.reading.read(path, given.as_ref(), wheels)?;
     warn(&log.warnings);
@@ -136,8 +117,8 @@ fn recorded(path: &Path, args: &Args) -> anyhow::Result<LogSource> {
     Ok(LogSource {
         log,
         robot,
-        configuration: args.config,
-        start: start(args)?,
+        configuration: args.begin.config,
+        start: args.begin.start(None)?,
         speed: args.speed.0,
         title,
         blueprint: None,
@@ -146,7 +127,7 @@ fn recorded(path: &Path, args: &Args) -> anyhow::Result<LogSource> {
 
 fn simulated(world: &Path, args: &Args) -> anyhow::Result<LogSource> {
     let world = World::load(world)?;
-    let robot = args.robot.as_deref().map_or_else(|| Ok(Robot::usual_for("simulated")), Robot::load)?;
+    let robot = args.begin.robot()?.unwrap_or_else(|| Robot::usual_for("simulated"));
     let mut errors = SimConfig::default();
     for setting in &args.settings {
         errors.set(setting)?;
@@ -156,8 +137,8 @@ fn simulated(world: &Path, args: &Args) -> anyhow::Result<LogSource> {
     Ok(LogSource {
         log: drive.log,
         robot,
-        configuration: args.config,
-        start: start(args)?,
+        configuration: args.begin.config,
+        start: args.begin.start(None)?,
         speed: args.speed.0,
         title: format!("{}, seed {}", world.name, args.seed),
         blueprint: Some(blueprint),

@@ -11,3 +11,4 @@ pub mod replay;
 pub mod scan;
 pub mod score;
 pub mod simulate;
+pub mod start_args;

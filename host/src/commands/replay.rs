@@ -2,35 +2,22 @@
 
 use std::path::PathBuf;
 
-use lineslam::map_file::{MapFile, MapFileError};
 use lineslam::output;
 use lineslam::output::report::Report;
 use lineslam::output::svg::Scene;
-use lineslam::replay::Start;
-use lineslam::robot::Robot;
 use nalgebra::Isometry2;
 use slam_core::geometry::pose::pose;
 
-use super::common::{self, Configuration, print_summary, results};
+use super::common::{self, print_summary, results};
 use super::log_args::{LogArgs, warn};
+use super::start_args::StartArgs;
 
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
     log: LogArgs,
-    /// Robot file: wheels, scanner, mounting. Without it what the log states is used; what it does not, such as noise, is that of
-    /// mines.toml for a mines log and of sick.toml for others.
-    #[arg(long, value_name = "FILE")]
-    robot: Option<PathBuf>,
-    /// Which algorithm.
-    #[arg(long, value_enum, default_value_t = Configuration::Default)]
-    config: Configuration,
-    /// Begin in this map, a map.json of an earlier replay, and go on mapping. Where the robot stands in it is looked for.
-    #[arg(long, value_name = "FILE")]
-    map: Option<PathBuf>,
-    /// Only find the way in the map: it stays as it is.
-    #[arg(long, requires = "map")]
-    localise: bool,
+    #[command(flatten)]
+    begin: StartArgs,
     /// Where the robot stands in the map: x and y in metres, heading in degrees.
     #[arg(long, value_name = "X,Y,DEG", requires = "map", allow_hyphen_values = true, value_parser = start_pose)]
     start: Option<Isometry2<f32>>,
@@ -57,23 +44,20 @@ fn start_pose(text: &str) -> Result<Isometry2<f32>, String> {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    if args.map.is_some() && args.config != Configuration::Default {
-        return Err(MapFileError::Configuration(args.config.name()).into());
-    }
-    let map = args.map.as_deref().map(MapFile::load).transpose()?;
-    let start = Start { map, pose: args.start, frozen: args.localise };
+    let start = args.begin.start(args.start)?;
+    let config = args.begin.config;
     // A given robot file is checked first: its beams are what the log must have.
-    let given = args.robot.as_deref().map(Robot::load).transpose()?;
+    let given = args.begin.robot()?;
     let wheels = given.as_ref().is_some_and(|robot| robot.wheels.is_some());
     let log = args.log.read(given.as_ref(), wheels)?;
     let robot = given.unwrap_or_else(|| log.usual_robot());
     warn(&log.warnings);
-    let result = common::run(&start, &log, &robot, args.config)?;
-    let report = Report::new(&log, &robot, args.config.name(), &result);
+    let result = common::run(&start, &log, &robot, config)?;
+    let report = Report::new(&log, &robot, config.name(), &result);
     warn(report.warnings.get(log.warnings.len()..).unwrap_or_default());
     let path = &args.log.log;
     let name = path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
-    let scene = Scene { title: &name, subtitle: args.config.subtitle(), ..Scene::default() };
+    let scene = Scene { title: &name, subtitle: config.subtitle(), ..Scene::default() };
     let files = results(&log, &result, &report, &scene, args.mcap.as_deref())?;
     output::write_all(&args.out, &files)?;
     print_summary("log", &path.display().to_string(), &args.out, &report);

@@ -1,6 +1,8 @@
 //! What the robot says, in words.
 
-use super::from_robot::{Event, Outcome, State};
+use slam_core::odometry::wheel_faults::WheelFault;
+
+use super::from_robot::{self, Event, Outcome, State};
 
 /// What has happened.
 pub fn of_event(event: &Event) -> String {
@@ -9,12 +11,27 @@ pub fn of_event(event: &Event) -> String {
         Event::SensorLost => "no scans: the robot goes on by odometry".into(),
         Event::SensorFound => "scans again".into(),
         Event::LoopClosed => "a loop was closed".into(),
-        Event::Wheels(Some(fault)) => format!("something is wrong with the wheels: {fault:?}"),
+        Event::Wheels(Some(fault)) => fault_of(*fault).message().into(),
         Event::Wheels(None) => "the wheels are as they should be again".into(),
         Event::MapFull => "the map is full: old lines give way".into(),
         Event::State(now) => format!("the robot is {}", of_state(*now)),
         Event::CountersRestarted => "the wheels' counters began anew".into(),
         Event::ScanRefused => "a scan was refused: another number of beams".into(),
+    }
+}
+
+/// A fault of the wheels, as the core knows it.
+pub fn fault_of(fault: from_robot::WheelFault) -> WheelFault {
+    use from_robot::WheelFault as Said;
+    match fault {
+        Said::Swapped => WheelFault::Swapped,
+        Said::LeftReversed => WheelFault::LeftReversed,
+        Said::RightReversed => WheelFault::RightReversed,
+        Said::BothReversed => WheelFault::BothReversed,
+        Said::SwappedAndReversed => WheelFault::SwappedAndReversed,
+        Said::LeftDead => WheelFault::LeftDead,
+        Said::RightDead => WheelFault::RightDead,
+        Said::BothDead => WheelFault::BothDead,
     }
 }
 

@@ -7,6 +7,7 @@ use std::borrow::Cow;
 use std::time::{Duration, Instant};
 
 use nalgebra::Isometry2;
+use slam_core::capacity::{PLACES, SEGMENTS};
 use slam_core::frontend::deskew::{ScanPoint, deskew};
 use slam_core::geometry::pose::components;
 use slam_core::odometry::track::ScanMotion;
@@ -21,7 +22,7 @@ use super::source::{
 use super::status::{Status, Troubles};
 use crate::configuration::Configuration;
 use crate::log::Log;
-use crate::replay::{MAP_SEGMENTS, MOST_BEAMS, ReplayError, Run, Start, Taken};
+use crate::replay::{MOST_BEAMS, ReplayError, Run, Start, Taken};
 use crate::robot::Robot;
 use crate::sim::world::Edge;
 
@@ -29,8 +30,6 @@ use crate::sim::world::Edge;
 const LONGEST_GAP: Duration = Duration::from_secs(2);
 /// Status is told so often, microseconds of the log.
 const STATUS_EVERY_US: u64 = 1_000_000;
-/// Places that the replayed core has room for.
-const PLACES: u32 = 96;
 /// Stack of the thread that plays it, bytes: the core passes over it when it is made.
 const STACK: usize = 16 << 20;
 /// Faster than this is as fast as it can.
@@ -357,8 +356,8 @@ impl<'a> Player<'a> {
             scans_per_s: self.scans_per_s,
             scan_us: took.as_micros().try_into().unwrap_or(u32::MAX),
             way_m: slam.way_m(),
-            lines: [slam.map().segments().len() as u32, MAP_SEGMENTS as u32],
-            places: [slam.places().anchors().len() as u32, PLACES],
+            lines: [slam.map().segments().len() as u32, SEGMENTS as u32],
+            places: [slam.places().anchors().len() as u32, PLACES as u32],
             core: slam.counters(),
             map: slam.map().counters(),
             odometry: mapper.counters(),

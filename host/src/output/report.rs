@@ -194,7 +194,7 @@ impl Report {
             counters: replay.counters,
             map_counters: replay.map_counters,
             slam_bytes: replay.slam_bytes,
-            map_capacity: crate::replay::MAP_SEGMENTS,
+            map_capacity: slam_core::capacity::SEGMENTS,
             simulation: None,
             config: replay.config,
         }

@@ -2,12 +2,13 @@
 
 use std::time::{Duration, Instant};
 
+use slam_core::capacity::{PLACES, SEGMENTS};
 use slam_core::config::ConfigError;
 use slam_core::geometry::pose::pose;
 use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
 use slam_core::{Mapper, ScanMotion, SlamConfig, SlamUpdate, WheelTicks};
 
-use super::{MAP_SEGMENTS, MOST_BEAMS, PLACES, ReplayError, Start};
+use super::{MOST_BEAMS, ReplayError, Start};
 use crate::log::{Log, Odometry};
 use crate::robot::{Robot, Wheels};
 
@@ -39,7 +40,7 @@ pub struct Run<'a, const BEAMS: usize = MOST_BEAMS> {
     feed: OdometryFeed<'a>,
     next: usize,
     /// What the robot has aboard. Between scans it can be told what a robot can be told.
-    pub mapper: Box<Mapper<MAP_SEGMENTS, TRACK, BEAMS, PLACES>>,
+    pub mapper: Box<Mapper<SEGMENTS, TRACK, BEAMS, PLACES>>,
 }
 
 /// What came of a scan.
@@ -131,7 +132,7 @@ fn refused(robot: &Robot) -> impl FnOnce(ConfigError) -> ReplayError {
 fn new_mapper<const BEAMS: usize>(
     robot: &Robot,
     config: SlamConfig,
-) -> Result<Box<Mapper<MAP_SEGMENTS, TRACK, BEAMS, PLACES>>, ReplayError> {
+) -> Result<Box<Mapper<SEGMENTS, TRACK, BEAMS, PLACES>>, ReplayError> {
     let wheels = robot.wheels.zip(robot.drive());
     let drive = wheels.map(|(wheels, drive)| drive_of_counters(&wheels, drive));
     Mapper::new(config, drive).map(Box::new).map_err(refused(robot))
@@ -173,7 +174,7 @@ impl<'a> OdometryFeed<'a> {
     /// Feeds samples until one lies at or after `until_us`.
     fn advance<const BEAMS: usize>(
         &mut self,
-        mapper: &mut Mapper<MAP_SEGMENTS, TRACK, BEAMS, PLACES>,
+        mapper: &mut Mapper<SEGMENTS, TRACK, BEAMS, PLACES>,
         until_us: u64,
     ) {
         while self.last.is_none_or(|(logged_us, _)| logged_us + STAMP_OFFSET_US < until_us)

@@ -95,6 +95,14 @@ impl MapSegment {
         cross(self.direction, point - self.centroid)
     }
 
+    /// Whether a point of it lies within `reach_m` of a position.
+    pub(crate) fn is_within(&self, position: Point2<f32>, reach_m: f32) -> bool {
+        let from_centroid = position - self.centroid;
+        let [from, to] = self.ends.map(|steps| f32::from(steps) * END_STEP_M);
+        let along_m = max(min(self.direction.dot(&from_centroid), to), from);
+        (from_centroid - self.direction * along_m).norm_squared() < reach_m * reach_m
+    }
+
     /// Number of points it was fitted to.
     pub fn inliers(&self) -> u32 {
         self.inliers
@@ -183,6 +191,17 @@ mod tests {
             let again = entry.with_segment(&back);
             prop_assert_eq!(again.ends, entry.ends, "what was rounded once stays");
             prop_assert_eq!(entry.with_segment(&entry.segment().transformed(&pose(3.0, -7.0, 1.0))).ends, entry.ends);
+        }
+    }
+
+    #[test]
+    fn it_is_within_reach_of_what_its_nearest_point_is() {
+        let entry = MapSegment::new(&segment([1.0, 2.0], 0.6, [-1.0, 3.0], [0.01, 0.01]), 1, 1, 0.0);
+        let positions = (0..400).map(|k| Point2::new((k % 20) as f32 - 10.0, (k / 20) as f32 - 10.0));
+        for position in positions {
+            let distance_m = (entry.segment().nearest_to(position) - position).norm();
+            assert!(entry.is_within(position, distance_m + 1e-3), "{position}");
+            assert!(distance_m < 1e-3 || !entry.is_within(position, distance_m - 1e-3), "{position}");
         }
     }
 

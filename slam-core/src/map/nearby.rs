@@ -66,7 +66,7 @@ impl<const N: usize> Nearby<N> {
         self.indices.clear();
         // At most as many as the map holds, which is the capacity.
         let _ = self.indices.resize(usize::from(begin), 0);
-        for (index, sector) in sectors.iter().enumerate() {
+        for (index, sector) in sectors.iter().take(map.len()).enumerate() {
             let Some(end) = self.ends.get_mut(usize::from(*sector)) else { continue };
             if let Some(place) = self.indices.get_mut(usize::from(*end)) {
                 *place = index as u16;

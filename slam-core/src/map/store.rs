@@ -252,8 +252,15 @@ impl core::fmt::Display for MapError {
 
 impl core::error::Error for MapError {}
 
+/// Headings are stored in steps of this, radians: many times what a heading is off by once it was sine and cosine, so that what is stored
+/// comes back as it was, however often.
+const HEADING_STEP_RAD: f32 = 1e-5;
+
 fn numbers(pose: &Isometry2<f32>) -> [f32; 3] {
-    components(pose).into()
+    let [x, y, heading]: [f32; 3] = components(pose).into();
+    let steps = heading / HEADING_STEP_RAD;
+    // The conversion cuts towards zero.
+    [x, y, HEADING_STEP_RAD * (steps + 0.5_f32.copysign(steps)) as i32 as f32]
 }
 
 fn isometry([x, y, heading]: [f32; 3]) -> Isometry2<f32> {
@@ -264,6 +271,7 @@ fn isometry([x, y, heading]: [f32; 3]) -> Isometry2<f32> {
 mod tests {
     use super::*;
     use crate::map::fixtures::line;
+    use proptest::prelude::*;
 
     #[test]
     fn a_line_comes_back_as_it_was() {
@@ -286,6 +294,16 @@ mod tests {
         let back = StoredLine::of(&entry).entry().unwrap();
         assert!((back.segment().moments.centroid - entry.segment().moments.centroid).norm() < 1e-5);
         assert!((back.length_m() - 0.2).abs() < 1e-5);
+    }
+
+    proptest! {
+        #[test]
+        fn a_pose_comes_back_as_it_was_stored(x in -100f32..100.0, y in -100f32..100.0, heading in -3.2f32..3.2) {
+            let stored = numbers(&isometry([x, y, heading]));
+            prop_assert_eq!(numbers(&isometry(stored)), stored);
+            let off = isometry(stored).inv_mul(&isometry([x, y, heading]));
+            prop_assert!(off.translation.vector.norm() < 1e-6 && off.rotation.angle().abs() < HEADING_STEP_RAD);
+        }
     }
 
     #[test]

@@ -109,7 +109,8 @@ const AROUND: usize = 48;
 
 /// The longest lines of the map of which a point lies within `reach_m` of a pose, in its frame, sorted by direction. Work: a pass over the map.
 pub(super) fn around(map: &[MapSegment], at: &Isometry2<f32>, reach_m: f32) -> Vec<Ray, AROUND> {
-    let is_known = |entry: &&MapSegment| entry.hits >= LEAST_HITS && is_within(&entry.segment(), at, reach_m);
+    let position = at.translation.vector.into();
+    let is_known = |entry: &&MapSegment| entry.hits >= LEAST_HITS && entry.is_within(position, reach_m);
     let longest = longest::<_, AROUND>(map.iter().filter(is_known), |entry| entry.length_m());
     let place_from_map = at.inverse();
     let in_place = |entry: &&MapSegment| {
@@ -199,13 +200,7 @@ pub(super) fn chosen(
 fn is_of(entry: &MapSegment, anchor: &Isometry2<f32>) -> bool {
     entry.hits >= LEAST_HITS
         && entry.length_m() >= LEAST_LENGTH_M
-        && is_within(&entry.segment(), anchor, REACH_M)
-}
-
-/// Whether a point of a segment lies within `reach_m` of a pose.
-fn is_within(segment: &Segment, at: &Isometry2<f32>, reach_m: f32) -> bool {
-    let nearest = segment.nearest_to(at.translation.vector.into());
-    (nearest.coords - at.translation.vector).norm_squared() < reach_m * reach_m
+        && entry.is_within(anchor.translation.vector.into(), REACH_M)
 }
 
 /// The ends of a line in a place's frame, none farther along it from the place's foot than [`REACH_M`].

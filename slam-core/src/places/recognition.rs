@@ -9,7 +9,7 @@ use nalgebra::Isometry2;
 
 use super::lines::Ray;
 use super::matching::shared;
-use crate::few::keep_most;
+use crate::few::{keep_most, sort_few};
 use crate::geometry::math::{max, min, wrap_angle};
 use crate::geometry::pose::{are_close, pose};
 
@@ -27,8 +27,8 @@ const LEAST_EXPLAINED: f32 = 0.5;
 /// … and what is nearly the same pose, metres and radians.
 pub(crate) const SAME: [f32; 2] = [0.5, 0.26];
 
-/// Poses of `query`, longest lines first, among lines sorted by direction, whatever is known of where it is: those that explain most. Its
-/// longest lines propose them, by their ends.
+/// Poses of `query`, longest lines first, among lines sorted by direction, whatever is known of where it is: those that explain most, the
+/// best first. Its longest lines propose them, by their ends.
 ///
 /// Work: for each of [`BY_ENDS`] lines and each of the others two poses, most of which a look at some of the lines that run alike rules out.
 pub(super) fn anywhere(query: &[Ray], lines: &[Ray]) -> Vec<Isometry2<f32>, PROPOSED> {
@@ -49,6 +49,7 @@ pub(super) fn anywhere(query: &[Ray], lines: &[Ray]) -> Vec<Isometry2<f32>, PROP
             }
         }
     }
+    sort_few(&mut best, |(_, explained_m)| -explained_m);
     best.iter().map(|(pose, _)| *pose).collect()
 }
 

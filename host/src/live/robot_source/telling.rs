@@ -3,12 +3,11 @@
 use slam_core::map::MapCounters;
 use slam_core::mapper::MapperCounters;
 use slam_core::odometry::delay::Delay;
-use slam_core::odometry::wheel_faults::WheelFault;
 use slam_core::slam::Counters;
 use slam_core::tracking::TrackingState;
 
 use crate::link::from_robot::{self, Event, Hello, State};
-use crate::link::{Client, MapCopy};
+use crate::link::{Client, MapCopy, words};
 use crate::live::source::{Line, Places, Pose, Weight};
 use crate::live::status::{Counter, Status, Troubles};
 
@@ -22,20 +21,6 @@ fn state_of(state: State) -> TrackingState {
         State::Tracking => TrackingState::Tracking,
         State::Uncertain => TrackingState::Uncertain,
         State::Lost => TrackingState::Lost,
-    }
-}
-
-fn fault_of(fault: from_robot::WheelFault) -> WheelFault {
-    use from_robot::WheelFault as Said;
-    match fault {
-        Said::Swapped => WheelFault::Swapped,
-        Said::LeftReversed => WheelFault::LeftReversed,
-        Said::RightReversed => WheelFault::RightReversed,
-        Said::BothReversed => WheelFault::BothReversed,
-        Said::SwappedAndReversed => WheelFault::SwappedAndReversed,
-        Said::LeftDead => WheelFault::LeftDead,
-        Said::RightDead => WheelFault::RightDead,
-        Said::BothDead => WheelFault::BothDead,
     }
 }
 
@@ -152,7 +137,7 @@ impl Health {
                 counters_restarted: said.counters_restarted,
                 ..MapperCounters::default()
             },
-            wheel_fault: said.wheel_fault.map(fault_of),
+            wheel_fault: said.wheel_fault.map(words::fault_of),
             odometry_useless: false,
             delay: said.delay.map(|(delay_s, sigma_s, used)| Delay { delay_s, sigma_s, used }),
             more: self.counters(said, health),
