@@ -228,7 +228,7 @@ impl Relocaliser {
             self.next = (index + 1) as u8;
             if let Some(candidate) = self.hypotheses.get_mut(index)
                 && let Some((hypothesis, support)) =
-                    held_against(evidence, &candidate.prior(), tracker, watch)
+                    held_against(evidence, &candidate.prior(), 0.0, tracker, watch)
             {
                 candidate.take(&hypothesis, support);
             }
@@ -256,9 +256,8 @@ impl Relocaliser {
             for pose in poses.into_iter().take(most) {
                 most -= 1;
                 let proposed = Prior { pose, covariance: diagonal(PROPOSED) };
-                if let Some((hypothesis, support)) = held_against(evidence, &proposed, tracker, watch)
-                    && support >= config.least_support
-                {
+                let laid = held_against(evidence, &proposed, config.least_support, tracker, watch);
+                if let Some((hypothesis, support)) = laid {
                     let mut candidate = PoseHypothesis::at(proposed);
                     candidate.take(&hypothesis, support);
                     self.add(candidate);
@@ -340,15 +339,16 @@ impl PoseHypothesis {
 }
 
 /// Lays the scan on the map around a pose: the pose refined, and the share of the scan that speaks for it, of what lies where the map knows
-/// what stands. None where that is little.
+/// what stands. None where that is little, or where a smaller share than `least` speaks for it.
 fn held_against<const N: usize, const P: usize>(
     evidence: &Evidence<'_, P>,
     prior: &Prior,
+    least: f32,
     tracker: &mut Tracker<N>,
     watch: &mut impl FnMut(Stage),
 ) -> Option<(Hypothesis, f32)> {
     let Evidence { scene, scan, places, .. } = evidence;
-    let hypothesis = tracker.refined_at(scene, prior, watch);
+    let hypothesis = tracker.corrected_at(scene, prior, watch);
     let pose = hypothesis.pose;
     let segments = scene.observed.iter();
     let is_known: Vec<bool, MAX_SEGMENTS> =
@@ -359,8 +359,11 @@ fn held_against<const N: usize, const P: usize>(
     if known < LEAST_KNOWN * all {
         return None;
     }
-    let contradicted = tracker.contradicted_share(scene, scan, &pose);
     let counts = |k: usize| is_known.get(k).copied().unwrap_or(false);
-    let support = tracker.score_of(scene, &pose, counts) * (1.0 - contradicted);
-    Some((hypothesis, support))
+    let score = tracker.score_of(scene, &pose, counts);
+    if score < least {
+        return None;
+    }
+    let support = score * (1.0 - tracker.contradicted_share(scene, scan, &pose));
+    (support >= least).then_some((hypothesis, support))
 }

@@ -93,7 +93,7 @@ impl<const N: usize> Tracker<N> {
         self.shortlist.clear();
     }
 
-    /// Share of those of the observed segments that count, by their index, which the map explains from a pose that was just [refined](Self::refined).
+    /// Share of those of the observed segments that count, by their index, which the map explains from a pose that was just [corrected](Self::corrected_at).
     pub fn score_of(&self, scene: &Scene<'_>, pose: &Isometry2<f32>, counts: impl Fn(usize) -> bool) -> f32 {
         tight_score(scene.observed, &self.pairs, scene.map, pose, &scene.config.line_noise, counts).0
     }
@@ -194,9 +194,26 @@ impl<const N: usize> Tracker<N> {
         tracked.left_out = by_scan.then(|| left_out(&best.pose, &prior.pose));
     }
 
-    /// Rounds of association and correction from a start.
-    #[inline(never)]
+    /// Rounds of association and correction from a start, and the score of what they end with.
     pub fn refined(
+        &mut self,
+        scene: &Scene<'_>,
+        prior: &Prior,
+        start: Hypothesis,
+        kernel: Kernel,
+        watch: &mut impl FnMut(Stage),
+    ) -> Hypothesis {
+        let mut hypothesis = self.converged(scene, prior, start, kernel, watch);
+        let line_noise = &scene.config.line_noise;
+        (hypothesis.score, hypothesis.explained) =
+            tight_score(scene.observed, &self.pairs, scene.map, &hypothesis.pose, line_noise, |_| true);
+        hypothesis.paired = self.pairs.len() as u8;
+        hypothesis
+    }
+
+    /// The same without the score.
+    #[inline(never)]
+    fn converged(
         &mut self,
         scene: &Scene<'_>,
         prior: &Prior,
@@ -223,10 +240,6 @@ impl<const N: usize> Tracker<N> {
                 break;
             }
         }
-        let line_noise = &scene.config.line_noise;
-        (hypothesis.score, hypothesis.explained) =
-            tight_score(scene.observed, &self.pairs, scene.map, &hypothesis.pose, line_noise, |_| true);
-        hypothesis.paired = self.pairs.len() as u8;
         hypothesis
     }
 
@@ -265,7 +278,18 @@ impl<const N: usize> Tracker<N> {
         winner
     }
 
-    /// A pose that somebody proposes, refined in the map around it.
+    /// A pose that somebody proposes, corrected in the map around it; [`score_of`](Self::score_of) tells its score.
+    pub fn corrected_at(
+        &mut self,
+        scene: &Scene<'_>,
+        prior: &Prior,
+        watch: &mut impl FnMut(Stage),
+    ) -> Hypothesis {
+        self.gather(scene.map, &prior.pose, scene.config);
+        self.converged(scene, prior, Hypothesis::of_prior(prior), Kernel::Strict, watch)
+    }
+
+    /// The same with its score.
     pub fn refined_at(
         &mut self,
         scene: &Scene<'_>,
