@@ -299,6 +299,7 @@ impl Default for SlamConfig {
                 min_information_ratio: 0.1,
                 reactivation_inflation: 2.0,
                 max_nis: 60.0,
+                max_joint_chi2: 9.2,
                 kernel_nis: 2.0,
                 tentative_hits: 4,
                 tentative_scans_per_hit: 2.1,

@@ -172,6 +172,7 @@ impl SlamConfig {
                 c.reactivation_inflation >= 1.0 && c.reactivation_inflation.is_finite(),
             )?;
             positive("registration.ekf.max_nis", c.max_nis)?;
+            positive("registration.ekf.max_joint_chi2", c.max_joint_chi2)?;
             positive("registration.ekf.kernel_nis", c.kernel_nis)?;
             positive("registration.ekf.keyframes.way_m", c.keyframes.way_m)?;
             check("registration.ekf.keyframes.scans", c.keyframes.scans > 0)?;

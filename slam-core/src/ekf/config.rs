@@ -49,6 +49,8 @@ pub struct EkfConfig {
     pub reactivation_inflation: f32,
     /// A pair with a larger normalised innovation squared is rejected.
     pub max_nis: f32,
+    /// Largest χ² between two observed segments that are one line of the map, by their own errors; 9.2 is the 99 % point.
+    pub max_joint_chi2: f32,
     /// From this normalised innovation squared on, a pair's R grows in proportion to it.
     pub kernel_nis: f32,
     /// A line seen in fewer scans than this is tentative. A tentative one that is seen only now and then may be walking, or

@@ -10,6 +10,7 @@ use heapless::Vec;
 use nalgebra::{Isometry2, Point2, Vector3};
 
 use crate::config::SlamConfig;
+use crate::ekf::compatibility::jointly_compatible;
 use crate::ekf::config::EkfConfig;
 use crate::ekf::filter::EkfSlam;
 use crate::ekf::line_map::LineMap;
@@ -146,9 +147,9 @@ impl KeyframeUpdate {
         (self.done, self.pending) = (0, None);
     }
 
-    /// Makes the measurements of a keyframe, and adds to the map what is not known.
+    /// Makes the measurements of a keyframe, and adds to the map what is not known, or cannot be what it is paired with.
     ///
-    /// Work: for each pair some steps, and one for each other pair.
+    /// Work: for each pair some steps, and two for each other pair.
     pub fn begin<const N: usize>(
         &mut self,
         seen: &Observed<'_>,
@@ -159,6 +160,9 @@ impl KeyframeUpdate {
     ) -> RegistrationReport {
         self.clear();
         self.pending = Some((*at, seen.stamp.scan));
+        let pairs =
+            jointly_compatible(seen.pairs, seen.segments, &seen.sensor.line_noise, config.max_joint_chi2);
+        let seen = &Observed { pairs: &pairs, ..*seen };
         let mut report = RegistrationReport { keyframe: true, ..RegistrationReport::default() };
         let ratios = information_ratios(seen, at, config, filter, map);
         for (index, pair) in seen.pairs.iter().enumerate() {

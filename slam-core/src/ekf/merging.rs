@@ -100,7 +100,7 @@ enum Relation {
 
 impl Relation {
     /// Lines are of one wall where they agree within their uncertainty. They are one piece, too, where they lie so close behind each
-    /// other that one would hide the other.
+    /// other that one would hide the other; a scan that saw both tells that it does not.
     fn of(
         a: &MapSegment,
         b: &MapSegment,
@@ -108,6 +108,7 @@ impl Relation {
         noise: &LineNoise,
         config: &EkfConfig,
     ) -> Option<Self> {
+        let seen_beside = a.last_seen == b.last_seen;
         let (a, b) = (&a.segment(), &b.segment());
         let facing = a.direction.dot(&b.direction) > 0.0;
         if !facing || cross(a.direction, b.direction).abs() > config.merge_max_angle_rad {
@@ -120,7 +121,8 @@ impl Relation {
             return None;
         }
         let gap_m = -long.overlap_m(short);
-        let hides = -gap_m >= config.merge_overlap * short.length_m()
+        let hides = !seen_beside
+            && -gap_m >= config.merge_overlap * short.length_m()
             && distance <= config.merge_sigmas * noise.sigma_offset_m;
         let agrees = || {
             Residual::new(short, long, *position, noise)

@@ -15,6 +15,7 @@
 //! | `slots` | which line has which states; augmentation |
 //! | `line_map` | map and slots, changed at once |
 //! | [`keyframe`] | which scans the filter sees |
+//! | `compatibility` | which pairs can all be right |
 //! | [`keyframe_update`], `merging` | the update of a keyframe, spread over scans; lines that are one wall |
 //! | [`config`] | settings |
 //!
@@ -22,6 +23,7 @@
 //! "Quaternion kinematics for the error-state Kalman filter" (2017), for error state, injection and reset; S. F. Schmidt,
 //! "Application of state-space methods to navigation problems" (1966), for updates of a part of the state.
 
+mod compatibility;
 pub mod config;
 mod deferred;
 pub mod filter;
