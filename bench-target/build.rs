@@ -1,20 +1,10 @@
-//! The fixed set of scans, as constants: a drive through the simulated office, seed 1, and the map it ends with.
+//! Where the fixed set of scans is, and how the firmware is linked.
 
-use std::error::Error;
-use std::fmt::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::{env, fs};
 
-use lineslam::robot::Robot;
-use lineslam::sim::fixed_set::FixedSet;
-use nalgebra::{Isometry2, Vector2};
-use slam_core::MapSegment;
-use slam_core::geometry::pose::components;
-
-/// Scans in the set, one after the other.
-const SCANS: usize = 300;
-/// Segments of the largest map.
-const SEGMENTS: usize = 500;
+/// Names the file with the set, which `cargo xtask bench-target` makes.
+const SET: &str = "LINESLAM_FIXED_SET";
 
 fn main() {
     for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {
@@ -22,8 +12,8 @@ fn main() {
     }
     let root = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it")).join("..");
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
-    let (world, robot) = (root.join("worlds/office.toml"), root.join("robots/paper.toml"));
-    for file in [&world, &robot, &root.join("memory.x"), &PathBuf::from("build.rs")] {
+    println!("cargo::rerun-if-env-changed={SET}");
+    for file in [&root.join("memory.x"), &PathBuf::from("build.rs")] {
         println!("cargo::rerun-if-changed={}", file.display());
     }
     if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|os| os != "none") {
@@ -31,67 +21,13 @@ fn main() {
     }
     fs::copy(root.join("memory.x"), out.join("memory.x")).expect("memory.x can be copied");
     println!("cargo::rustc-link-search={}", out.display());
-    match constants(&world, &robot) {
-        Ok(text) => fs::write(out.join("set.rs"), text).expect("set.rs can be written"),
-        Err(error) => {
-            println!("cargo::error={error}");
-            std::process::exit(1);
-        }
+    let Some(set) = env::var_os(SET).map(PathBuf::from) else {
+        println!("cargo::error={SET} is not set; `cargo xtask bench-target` builds this");
+        std::process::exit(1);
+    };
+    println!("cargo::rerun-if-changed={}", set.display());
+    if let Err(error) = fs::copy(&set, out.join("set.rs")) {
+        println!("cargo::error={SET}: {}: {error}", set.display());
+        std::process::exit(1);
     }
-}
-
-fn constants(world: &Path, robot: &Path) -> Result<String, Box<dyn Error>> {
-    let set = FixedSet::new(world, &Robot::load(robot)?, SCANS)?;
-    let beams = set.ranges_mm.first().map_or(0, Vec::len);
-    let mut text = String::new();
-    writeln!(text, "/// Ranges of each scan, millimetres.")?;
-    writeln!(text, "static RANGES_MM: [[u16; {beams}]; {SCANS}] = [")?;
-    for ranges_mm in &set.ranges_mm {
-        writeln!(text, "{ranges_mm:?},")?;
-    }
-    writeln!(text, "];\n/// The motion that led to each scan.")?;
-    writeln!(text, "static MOTIONS: [Motion; {SCANS}] = [")?;
-    for motion in &set.motions {
-        let sweep: Vec<[f32; 3]> = motion.middle_from_knot.iter().map(numbers).collect();
-        let last = &motion.since_previous;
-        let (way, turn, moved) = (last.distance_m, last.turn_rad, numbers(&last.before_from_after));
-        writeln!(
-            text,
-            "Motion {{ distance_m: {way:?}, turn_rad: {turn:?}, moved: {moved:?}, sweep: {sweep:?} }},"
-        )?;
-    }
-    let begin = numbers(&set.begin);
-    writeln!(text, "];\n/// Where the robot was a scan before.\nconst BEGIN: [f32; 3] = {begin:?};")?;
-    writeln!(
-        text,
-        "/// The map, with the scans that saw each segment: nearest to the way first.\nstatic MAP: [(Segment, u16); {SEGMENTS}] = ["
-    )?;
-    for entry in set.map(SEGMENTS) {
-        writeln!(text, "{},", literal(&entry))?;
-    }
-    writeln!(text, "];")?;
-    Ok(text)
-}
-
-fn numbers(at: &Isometry2<f32>) -> [f32; 3] {
-    components(at).into()
-}
-
-fn literal(entry: &MapSegment) -> String {
-    let s = &entry.segment();
-    let m = &s.moments;
-    let vector = |v: Vector2<f32>| format!("Vector2::new({:?}, {:?})", v.x, v.y);
-    let point = |p: nalgebra::Point2<f32>| format!("Point2::new({:?}, {:?})", p.x, p.y);
-    format!(
-        "(Segment {{ moments: Moments {{ inliers: {}, weight: {:?}, centroid: {}, scatter: {:?} }}, \
-         direction: {}, start: {}, end: {} }}, {})",
-        m.inliers,
-        m.weight,
-        point(m.centroid),
-        m.scatter,
-        vector(s.direction),
-        point(s.start),
-        point(s.end),
-        entry.hits
-    )
 }

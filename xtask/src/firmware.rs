@@ -10,7 +10,9 @@ use crate::run::{cargo, ensure_target, is_installed, program, step, target_folde
 /// What probe-rs calls the default board's chip.
 pub const CHIP: &str = "STM32F429ZITx";
 /// What to build for the emulator, and how. The emulated part asks for a newer compiler than it needs.
-pub const EMULATOR: &str = "--profile emulator -p emulator --ignore-rust-version";
+const EMULATOR: &str = "--profile checked -p emulator --ignore-rust-version";
+/// Says where the scans are that the benchmark firmware is built with.
+pub const FIXED_SET: &str = "LINESLAM_FIXED_SET";
 /// Where finished ELF files are put, under the target folder.
 const ELF_FOLDER: &str = "firmware";
 
@@ -87,7 +89,7 @@ fn probe_rs(what: &str, elf: &Path) -> anyhow::Result<()> {
 pub fn emulate(arguments: &[String]) -> anyhow::Result<()> {
     let elf = build(Build::Flashed)?;
     build_emulator()?;
-    let mut command = program(target_folder().join("emulator/emulator"));
+    let mut command = program(target_folder().join("checked/emulator"));
     command.arg("--firmware").arg(elf).args(arguments);
     let status = command.status().context("cannot run the emulator")?;
     if !status.success() {
@@ -105,12 +107,19 @@ pub fn demo() -> anyhow::Result<()> {
 
 /// Counts what each stage of the core takes, on the emulated core.
 pub fn bench() -> anyhow::Result<()> {
+    build_emulator()?;
+    bench_when_built()
+}
+
+/// The same, where the emulator has been built.
+pub fn bench_when_built() -> anyhow::Result<()> {
     let mut command = bench_command()?;
     step("instructions on the emulated core", &mut command)
 }
 
 /// The same, with what it prints.
 pub fn bench_output() -> anyhow::Result<String> {
+    build_emulator()?;
     let output = bench_command()?.output().context("cannot run the benchmark")?;
     if !output.status.success() {
         bail!("the benchmark failed:\n{}", String::from_utf8_lossy(&output.stderr));
@@ -120,12 +129,22 @@ pub fn bench_output() -> anyhow::Result<String> {
 
 fn bench_command() -> anyhow::Result<std::process::Command> {
     ensure_target()?;
+    let set = fixed_set()?;
     let command = format!("build --quiet --release -p bench-target --target {TARGET}");
-    step("benchmark firmware", &mut cargo(&command))?;
-    build_emulator()?;
-    let mut command = program(target_folder().join("emulator/bench"));
+    step("benchmark firmware", cargo(&command).env(FIXED_SET, set))?;
+    let mut command = program(target_folder().join("checked/bench"));
     command.arg("--firmware").arg(target_folder().join(TARGET).join("release/bench-target"));
     Ok(command)
+}
+
+/// Makes the scans that the benchmark firmware is built with, by an emulator that has been built, and says where they are.
+pub fn fixed_set() -> anyhow::Result<PathBuf> {
+    std::fs::create_dir_all(target_folder().join(ELF_FOLDER)).context("the folder for ELF files")?;
+    let set = target_folder().join(ELF_FOLDER).join("fixed_set.rs");
+    let mut command = program(target_folder().join("checked/fixed-set"));
+    command.args(["--world", "worlds/office.toml", "--robot", "robots/paper.toml", "--out"]).arg(&set);
+    step("scans of the benchmark", &mut command)?;
+    Ok(set)
 }
 
 fn build_emulator() -> anyhow::Result<()> {

@@ -3,6 +3,8 @@
 use std::ffi::OsStr;
 use std::path::PathBuf;
 use std::process::Command;
+use std::sync::LazyLock;
+use std::time::Instant;
 
 use anyhow::{Context, bail};
 
@@ -49,9 +51,11 @@ pub fn step(title: &str, command: &mut Command) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A headline for what follows.
+/// A headline for what follows, with the time since the task began.
 pub fn announce(title: &str) {
-    println!("\n==> {title}");
+    static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
+    let s = BEGAN.elapsed().as_secs();
+    println!("\n==> {title} ({} min {:02} s)", s / 60, s % 60);
 }
 
 /// Adds the firmware's target to the toolchain if it is not there.

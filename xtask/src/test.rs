@@ -6,17 +6,19 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 
-use crate::firmware::EMULATOR;
+use crate::firmware::FIXED_SET;
 use crate::run::{announce, cargo, debian_package, ensure_target, is_installed, program, root, step};
 use crate::{TARGET, bench, firmware, size};
+
+/// All tests, in one profile, so that what they and the emulator share is built once.
+const TESTS: &str = "--workspace --profile checked --ignore-rust-version";
 
 /// Runs every check, cheapest first; the tests come last and close with their sum.
 pub fn everything() -> anyhow::Result<()> {
     ensure_target()?;
     step("format", &mut cargo("fmt --all --check"))?;
-    step("clippy, host", &mut cargo("clippy --workspace --exclude emulator --all-targets -- -D warnings"))?;
-    let emulator = "clippy -p emulator --ignore-rust-version --all-targets -- -D warnings";
-    step("clippy, emulator", &mut cargo(emulator))?;
+    let all = "--workspace --ignore-rust-version --all-targets";
+    step("clippy, host", &mut cargo(&format!("clippy {all} -- -D warnings")))?;
     for arguments in [
         "-p slam-core",
         "-p slam-core --features defmt,serde",
@@ -24,13 +26,10 @@ pub fn everything() -> anyhow::Result<()> {
         "-p scip --all-features",
         "-p link --features defmt",
         "-p footprint",
-        // As it is built: it makes its scans with the whole command, which is not to be built twice.
-        "--release -p bench-target",
         "-p firmware",
         "-p firmware --features misbehaves,sleeps",
     ] {
-        let command = format!("clippy {arguments} --target {TARGET} -- -D warnings");
-        step(&format!("clippy for {TARGET}: {arguments}"), &mut cargo(&command))?;
+        step(&format!("clippy for {TARGET}: {arguments}"), &mut clippy_for_target(arguments))?;
     }
     let features =
         "slam-core/defmt,slam-core/serde,scip/defmt,scip/embassy-time,scip/sim,scip/slam-core,link/defmt";
@@ -42,31 +41,36 @@ pub fn everything() -> anyhow::Result<()> {
     let elves = firmware::for_tests()?;
     size::report()?;
     bench::report()?;
-    firmware::bench()?;
+    // With all their tests: the emulator alone would be built with fewer features of what it shares with others, and again here.
+    step("build the tests", &mut cargo(&format!("test {TESTS} --no-run")))?;
+    let mut clippy = clippy_for_target("-p bench-target");
+    step(&format!("clippy for {TARGET}: -p bench-target"), clippy.env(FIXED_SET, firmware::fixed_set()?))?;
+    firmware::bench_when_built()?;
     let python = python_with_readers();
     browser();
     tests(python, &elves)
 }
 
-/// Runs all tests and adds up what the test runner says. The emulated runs are built with optimisations, the others are not.
+fn clippy_for_target(arguments: &str) -> Command {
+    cargo(&format!("clippy {arguments} --target {TARGET} -- -D warnings"))
+}
+
+/// Runs all tests, those on the emulated board among them, and adds up what the test runner says.
 fn tests(python: Option<PathBuf>, elves: &[(&str, PathBuf)]) -> anyhow::Result<()> {
-    let mut sum = Sum::default();
     announce("tests");
-    let mut command = cargo("test --workspace --exclude emulator --no-fail-fast");
+    let mut command = cargo(&format!("test {TESTS} --no-fail-fast"));
+    command.envs(elves.iter().map(|(name, path)| (name, path)));
     if let Some(python) = python {
         command.env("LINESLAM_PYTHON", python);
     }
-    let on_the_pc = run_tests(&mut command, &mut sum)?;
-    announce("tests on the emulated board");
-    let mut command = cargo(&format!("test {EMULATOR} --no-fail-fast"));
-    command.envs(elves.iter().map(|(name, path)| (name, path)));
-    let emulated = run_tests(&mut command, &mut sum)?;
+    let mut sum = Sum::default();
+    let succeeded = run_tests(&mut command, &mut sum)?;
     println!();
     for skipped in &sum.skipped {
         println!("{skipped}");
     }
     println!("{} passed, {} failed, {} skipped", sum.passed, sum.failed, sum.skipped.len());
-    if !on_the_pc || !emulated || sum.failed > 0 {
+    if !succeeded || sum.failed > 0 {
         bail!("tests failed");
     }
     if sum.passed == 0 {
