@@ -77,13 +77,12 @@ impl LogSource {
 
     fn about(&self) -> About {
         let laser = self.robot.sensor_for(&self.log.layout(0)).mounting.base_from_laser;
-        let ends = |edge: &Edge| [edge.from.x, edge.from.y, edge.to.x, edge.to.y].map(|v| v as f32);
         About {
             title: self.title.clone(),
             subtitle: format!("{}, {}", self.robot.name, self.configuration.subtitle()),
             kind: if self.blueprint.is_some() { Kind::Simulation } else { Kind::Log },
             base_from_laser: components(&laser).into(),
-            blueprint: self.blueprint.iter().flatten().map(ends).collect(),
+            blueprint: self.blueprint.iter().flatten().map(Edge::ends).collect(),
             paced: true,
         }
     }

@@ -57,7 +57,6 @@ impl Base {
         let scale = 1.0 + both * model.radius_error;
         let difference = 0.5 * one_sided * model.radius_difference;
         let waypoints: Vec<Point2<f64>> = path.points.iter().map(|&p| p.into()).collect();
-        let start = Vector2::new(waypoints[0].x, waypoints[0].y);
         let true_track = f64::from(wheels.track_m) * (1.0 + track * model.track_error);
         Self {
             true_radius: [
@@ -69,7 +68,7 @@ impl Base {
             rng,
             slip: Slip::new(model, &sim.fault, true_track, seed),
             encoders: Encoders::new(wheels, &sim.fault),
-            pose: Isometry2::new(start, path.heading_deg.to_radians()),
+            pose: path.start(),
             waypoints,
             speed: path.speed,
             next: 1,

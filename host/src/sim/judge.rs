@@ -173,7 +173,12 @@ pub fn map_in_world(drive: &Drive, map: &[MapSegment]) -> Vec<MapSegment> {
 
 /// The straight surfaces of the blueprint in the map's frame.
 pub fn blueprint_in_map(world: &World, drive: &Drive) -> Vec<Edge> {
-    let map_from_world = drive.truth.first().map_or_else(Isometry2::identity, Isometry2::inverse);
+    blueprint_from(world, &drive.truth.first().copied().unwrap_or_else(Isometry2::identity))
+}
+
+/// The same for a map that begins where the robot stands there in the world.
+pub fn blueprint_from(world: &World, world_from_map: &Isometry2<f64>) -> Vec<Edge> {
+    let map_from_world = world_from_map.inverse();
     let carried = |e: Edge| Edge { from: map_from_world * e.from, to: map_from_world * e.to, ..e };
     world.edges().into_iter().map(carried).collect()
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use nalgebra::{Point2, Vector2};
+use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Deserialize;
 
 use crate::toml_file::{self, Checked, FileError, Impossible, not_negative, positive};
@@ -153,6 +153,14 @@ pub struct DrivenPath {
     pub points: Vec<[f64; 2]>,
 }
 
+impl DrivenPath {
+    /// Where the base stands before it drives, in the world.
+    pub fn start(&self) -> Isometry2<f64> {
+        let at = self.points.first().map_or_else(Vector2::zeros, |at| Vector2::from(*at));
+        Isometry2::new(at, self.heading_deg.to_radians())
+    }
+}
+
 fn usual_pause_s() -> f64 {
     2.0
 }
@@ -166,6 +174,13 @@ pub struct Edge {
     pub to: Point2<f64>,
     /// Whether it is glass.
     pub glass: bool,
+}
+
+impl Edge {
+    /// x and y of both ends, as pages and pictures have them.
+    pub fn ends(&self) -> [f32; 4] {
+        [self.from.x, self.from.y, self.to.x, self.to.y].map(|v| v as f32)
+    }
 }
 
 /// A round surface.
