@@ -6,6 +6,7 @@ pub mod beams;
 pub mod benchmark;
 pub mod calibrate;
 pub mod configuration;
+pub mod emulated;
 pub mod experiments;
 pub mod link;
 pub mod live;

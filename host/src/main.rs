@@ -9,6 +9,7 @@ use clap::{Parser, Subcommand};
 use commands::{benchmark, calibrate, connect, experiments, live, replay, scan, score, simulate};
 use lineslam::benchmark::BenchmarkError;
 use lineslam::calibrate::CalibrationError;
+use lineslam::emulated::EmulationError;
 use lineslam::experiments::ExperimentError;
 use lineslam::log::LogError;
 use lineslam::map_file::MapFileError;
@@ -71,7 +72,8 @@ fn main() -> ExitCode {
                 || error.is::<BenchmarkError>()
                 || error.is::<BadSetting>()
                 || error.is::<CalibrationError>()
-                || error.is::<ExperimentError>();
+                || error.is::<ExperimentError>()
+                || matches!(error.downcast_ref(), Some(EmulationError::UnknownWorld { .. }));
             ExitCode::from(if bad_input { 2 } else { 1 })
         }
     }

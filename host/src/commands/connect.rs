@@ -4,6 +4,7 @@ use std::io::{IsTerminal, Write, stderr, stdin};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use lineslam::emulated::{Board, Drive, Driven};
 use lineslam::link::from_robot::{Cause, Health, Hello, Pose, Status};
 use lineslam::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams, words};
 use lineslam::output::tum;
@@ -15,6 +16,13 @@ pub struct Args {
     /// ST-LINK that is plugged in.
     #[arg(long, value_name = "PORT", global = true)]
     port: Option<Address>,
+    /// Instead of a robot: the firmware that is flashed, on an emulated board that drives through this world (a file, or a name in worlds/).
+    /// Builds what is missing, and ends with the drive; `map` prints the map of the whole drive.
+    #[arg(long, value_name = "WORLD", global = true, conflicts_with = "port")]
+    emulate: Option<String>,
+    /// Seed of the emulated drive.
+    #[arg(long, default_value_t = 1, global = true)]
+    seed: u64,
     /// Print the trajectory, a line of TUM format for each scan.
     #[arg(long)]
     tum: bool,
@@ -66,10 +74,34 @@ const SILENCE: Duration = Duration::from_secs(3);
 const RETRY: Duration = Duration::from_millis(500);
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    if let Some(world) = &args.emulate {
+        return emulated(world, args);
+    }
     let address = args.port.clone().map_or_else(Address::find, Ok)?;
     match &args.ask {
         Some(ask) => tell(&address, ask),
-        None => watch(args, &address),
+        None => watch(args, &address, None),
+    }
+}
+
+/// The same with an emulated robot. It ends with this, so that there is no use in changing what it does.
+fn emulated(world: &str, args: &Args) -> anyhow::Result<()> {
+    match &args.ask {
+        None => {
+            let mut board = Drive::new(world, args.seed, Some(1.0))?.start()?;
+            let address = board.address().clone();
+            watch(args, &address, Some(&mut board))
+        }
+        Some(Ask::Map) => {
+            let mut board = Drive::new(world, args.seed, None)?.start()?;
+            eprintln!("the robot drives; its map comes at the end");
+            board.wait()?;
+            print_map(board.address())
+        }
+        Some(_) => bail!(
+            "the emulated robot ends with this command, so it can be watched and print its map; to tell it something, run `lineslam live \
+             --emulate {world}`, or `cargo xtask emulate --world {world} --vcp 7411` and this with --port tcp://127.0.0.1:7411"
+        ),
     }
 }
 
@@ -140,10 +172,12 @@ fn print_map(address: &Address) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Shows what comes until it is interrupted, through resets and pulled cables.
-fn watch(args: &Args, address: &Address) -> anyhow::Result<()> {
+/// Shows what comes until it is interrupted, through resets and pulled cables, or until an emulated board's drive is over.
+fn watch(args: &Args, address: &Address, mut board: Option<&mut Board>) -> anyhow::Result<()> {
     let end = args.seconds.map(|seconds| Instant::now() + Duration::from_secs(seconds));
-    let is_over = || end.is_some_and(|end| Instant::now() >= end);
+    let driven = board.as_ref().map(|board| board.drive());
+    let is_over =
+        || end.is_some_and(|end| Instant::now() >= end) || driven.as_ref().is_some_and(Driven::is_over);
     // The first time it must be there.
     let mut client = Some(Client::connect(address)?);
     let mut shown = Shown { tum: args.tum, ..Shown::default() };
@@ -154,6 +188,9 @@ fn watch(args: &Args, address: &Address) -> anyhow::Result<()> {
             continue;
         };
         if let Err(error) = show(open, &mut shown, &is_over) {
+            if let Some(board) = &mut board {
+                board.check()?;
+            }
             eprintln!("{error}: waiting for it to come back");
             client = None;
         }

@@ -3,10 +3,12 @@
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
+use lineslam::emulated::{Board, Drive};
 use lineslam::link::{Address, LinkError};
+use lineslam::live::browser;
 use lineslam::live::log_source::LogSource;
-use lineslam::live::robot_source;
+use lineslam::live::robot_source::{self, Emulated};
 use lineslam::live::server::{Options, PORT, Server};
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
@@ -16,7 +18,7 @@ use super::log_args::{ReadArgs, warn};
 use super::start_args::StartArgs;
 
 #[derive(clap::Args)]
-#[command(group(clap::ArgGroup::new("source").required(true).args(["log", "simulate", "port"])))]
+#[command(group(clap::ArgGroup::new("source").required(true).args(["log", "simulate", "emulate", "port"])))]
 pub struct Args {
     /// The log: a ROS bag (.bag, .mcap, .db3 or its folder), a CARMEN or mines log or JSON lines, these plain or gzipped.
     log: Option<PathBuf>,
@@ -25,19 +27,23 @@ pub struct Args {
     /// Instead of a log: drive a simulated robot through this world, whose true walls are shown beneath the map.
     #[arg(long, value_name = "WORLD")]
     simulate: Option<PathBuf>,
+    /// Instead of a log: the firmware that is flashed, on an emulated board that drives through this world (a file, or a name in worlds/),
+    /// whose true walls are shown beneath the map. Builds what is missing.
+    #[arg(long, value_name = "WORLD", conflicts_with_all = ["robot", "config", "map"])]
+    emulate: Option<String>,
     /// Instead of a log: a robot. Its port, such as /dev/ttyACM0, or tcp://HOST:PORT of `cargo xtask emulate --vcp PORT`; without a value
     /// that of the ST-LINK that is plugged in.
     #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "auto", conflicts_with_all = ["robot", "config", "map", "speed"])]
     port: Option<String>,
-    /// Seed of the simulated drive.
-    #[arg(long, default_value_t = 1, requires = "simulate")]
+    /// Seed of the simulated or emulated drive.
+    #[arg(long, default_value_t = 1, conflicts_with_all = ["log", "port"])]
     seed: u64,
     /// Change an error of the simulated robot, or have something happen to it; `lineslam simulate --help` has all keys.
-    #[arg(long = "set", value_name = "KEY=VALUE", requires = "simulate")]
+    #[arg(long = "set", value_name = "KEY=VALUE", conflicts_with_all = ["log", "port"])]
     settings: Vec<String>,
     #[command(flatten)]
     begin: StartArgs,
-    /// Times as fast as it was recorded; 0 begins paused, `max` goes as fast as it can. The page can change it.
+    /// Times as fast as it was recorded; 0 begins paused, `max` goes as fast as it can. The page can change it, but for an emulated robot.
     #[arg(long, value_name = "TIMES", default_value = "1", value_parser = speed)]
     speed: Speed,
     /// Let other computers see the page: an address of this one, or 0.0.0.0 for all, with a port if it is not to be 8017. There is no
@@ -74,10 +80,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     args.begin.check()?;
     // The port first: a large log takes a while to read.
     let server = Server::bind(&Options { listen: args.listen, names: args.names.clone() })?;
-    let source = match (&args.port, &args.simulate) {
-        (Some(port), _) => robot_source::start(address(port)?)?,
-        (None, Some(world)) => simulated(world, args)?.start()?,
-        (None, None) => recorded(args.log.as_deref().context("no log")?, args)?.start()?,
+    // It runs as long as this is there.
+    let board = args.emulate.as_deref().map(|world| emulated(world, args)).transpose()?;
+    let source = match (&args.port, &args.simulate, &board) {
+        (_, _, Some((board, scene))) => robot_source::start_emulated(board.address().clone(), scene.clone())?,
+        (Some(port), _, _) => robot_source::start(address(port)?)?,
+        (None, Some(world), _) => simulated(world, args)?.start()?,
+        (None, None, None) => recorded(args.log.as_deref().context("no log")?, args)?.start()?,
     };
     let url = server.url();
     println!("{url}");
@@ -89,9 +98,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         );
     }
     if !args.no_open
-        && let Err(error) = open::that_detached(&url)
+        && let Err(error) = browser::show(&url)
     {
-        eprintln!("warning: no browser could be opened ({error}); open the address above yourself");
+        eprintln!("no browser was opened ({error}): open the address above yourself");
     }
     eprintln!("Ctrl-C ends it.");
     server.run(source, async {
@@ -105,6 +114,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 fn address(port: &str) -> Result<Address, LinkError> {
     if port == "auto" { Address::find() } else { port.parse() }
+}
+
+/// The board, and what is known of its world.
+fn emulated(world: &str, args: &Args) -> anyhow::Result<(Board, Emulated)> {
+    if args.speed.0 == Some(0.0) {
+        bail!("--speed 0: an emulated robot cannot be paused");
+    }
+    let mut drive = Drive::new(world, args.seed, args.speed.0)?;
+    drive.settings.clone_from(&args.settings);
+    let world = World::load(&drive.world)?;
+    let blueprint = judge::blueprint_from(&world, &world.path.start());
+    let title = format!("{}, seed {}, emulated", world.name, args.seed);
+    Ok((drive.start()?, Emulated { title, blueprint }))
 }
 
 fn recorded(path: &Path, args: &Args) -> anyhow::Result<LogSource> {

@@ -15,6 +15,7 @@
 //! can look at any instant. The page is plain modules in `page/`, without a build step and without anything from elsewhere.
 
 pub mod access;
+pub mod browser;
 pub mod history;
 mod hub;
 pub mod log_source;

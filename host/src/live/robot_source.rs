@@ -14,11 +14,14 @@ use super::source::{
 };
 use crate::link::from_robot::{Cause, Event, Hello, KeptMap, Outcome};
 use crate::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams, words};
+use crate::sim::world::Edge;
 use scan::Scans;
 use telling::Health;
 
 /// A robot says who it is within this.
 const GREETING: Duration = Duration::from_secs(4);
+/// An emulated one may be slow to boot on a busy computer.
+const EMULATED_GREETING: Duration = Duration::from_secs(30);
 /// Messages are waited for no longer than this, so that orders are not late.
 const LISTEN: Duration = Duration::from_millis(20);
 /// A port that is gone is tried again this often.
@@ -31,37 +34,71 @@ const RESET_US: u64 = 2_000_000;
 const SCAN_AGE_US: u64 = 500_000;
 const STREAMS: Streams = Streams::DEFAULT.with(Streams::SCANS).with(Streams::MAP);
 
+/// What is known of an emulated robot beside what it says.
+#[derive(Clone, Debug)]
+pub struct Emulated {
+    /// What it is called.
+    pub title: String,
+    /// The true walls, in its map.
+    pub blueprint: Vec<Edge>,
+}
+
 /// Opens the port and begins to listen. An error where there is no robot.
 pub fn start(address: Address) -> Result<Source, LinkError> {
+    begin(address, None)
+}
+
+/// The same for an emulated robot, which does not come back once it is gone.
+pub fn start_emulated(address: Address, emulated: Emulated) -> Result<Source, LinkError> {
+    begin(address, Some(emulated))
+}
+
+fn begin(address: Address, emulated: Option<Emulated>) -> Result<Source, LinkError> {
     let mut client = Client::connect(&address)?;
-    let hello = greet(&mut client)?;
-    let (source, feed) = channel(about(&address, &hello));
+    let hello = greet(&mut client, if emulated.is_some() { EMULATED_GREETING } else { GREETING })?;
+    let mut about = about(&address, &hello);
+    let comes_back = emulated.is_none();
+    if let Some(emulated) = emulated {
+        about.title = emulated.title;
+        about.blueprint = emulated.blueprint.iter().map(Edge::ends).collect();
+    }
+    let (source, feed) = channel(about);
     let mut robot = Watched::new(feed, &hello);
     std::thread::spawn(move || {
         let mut client = Some(client);
         // It ends when nobody looks any more.
-        while let Ok(open) = robot.listen(client.take(), &address) {
+        while let Ok(open) = robot.listen(client.take(), &address, comes_back) {
             client = open;
         }
     });
     Ok(source)
 }
 
-fn greet(client: &mut Client) -> Result<Hello, LinkError> {
+fn greet(client: &mut Client, within: Duration) -> Result<Hello, LinkError> {
     client.send(Command::Subscribe(STREAMS))?;
     let begun = Instant::now();
-    while begun.elapsed() < GREETING {
+    while begun.elapsed() < within {
         client.send(Command::Hello)?;
         let asked = Instant::now();
         while asked.elapsed() < RETRY {
             if let Some(FromRobot::Hello(hello)) = client.next(LISTEN)? {
+                // It may have booted since.
+                subscribe(client, &hello)?;
                 // What came before is passed over; the map is to come whole.
                 client.send(Command::SendMap { blocks: u32::MAX, places: true })?;
                 return Ok(hello);
             }
         }
     }
-    Err(LinkError::NoAnswer { address: client.address().clone(), waited: GREETING })
+    Err(LinkError::NoAnswer { address: client.address().clone(), waited: within })
+}
+
+/// A robot that was reset sends no more than the usual again.
+fn subscribe(client: &mut Client, hello: &Hello) -> Result<(), LinkError> {
+    if hello.streams != STREAMS {
+        client.send(Command::Subscribe(STREAMS))?;
+    }
+    Ok(())
 }
 
 fn about(address: &Address, hello: &Hello) -> About {
@@ -105,10 +142,24 @@ impl Watched {
     }
 
     /// Listens, or opens the port again, for a while. The port if it is there.
-    fn listen(&mut self, client: Option<Client>, address: &Address) -> Result<Option<Client>, Closed> {
-        let Some(mut client) = client else { return self.reopen(address) };
+    fn listen(
+        &mut self,
+        client: Option<Client>,
+        address: &Address,
+        comes_back: bool,
+    ) -> Result<Option<Client>, Closed> {
+        let Some(mut client) = client else {
+            return if comes_back { self.reopen(address) } else { self.mourn() };
+        };
         match self.exchange(&mut client)? {
             Ok(()) => Ok(Some(client)),
+            Err(_) if !comes_back => {
+                self.note(
+                    Weight::Info,
+                    "The emulated robot has ended. What is shown is how it was at last.",
+                )?;
+                Ok(None)
+            }
             Err(error) => {
                 self.note(Weight::Error, format!("{}: waiting for it to come back.", in_full(error)))?;
                 Ok(None)
@@ -116,12 +167,20 @@ impl Watched {
         }
     }
 
+    /// What was shown stays to be looked at; nothing can be asked of the robot any more.
+    fn mourn(&self) -> Result<Option<Client>, Closed> {
+        if let Some(order) = self.feed.order(None)? {
+            order.answer(Err("The emulated robot has ended.".into()));
+        }
+        Ok(None)
+    }
+
     fn reopen(&mut self, address: &Address) -> Result<Option<Client>, Closed> {
         if let Some(order) = self.feed.order(Some(RETRY))? {
             order.answer(Err("The robot is not connected.".into()));
         }
-        let again =
-            Client::connect(address).and_then(|mut client| greet(&mut client).map(|hello| (client, hello)));
+        let again = Client::connect(address)
+            .and_then(|mut client| greet(&mut client, GREETING).map(|hello| (client, hello)));
         let Ok((client, hello)) = again else { return Ok(None) };
         self.note(Weight::Info, format!("{address}: connected again."))?;
         self.greeted(&hello)?;
@@ -141,6 +200,11 @@ impl Watched {
                 (self.heard, self.is_silent) = (Instant::now(), false);
                 if let Some(again) = self.map.take(&message)
                     && let Err(error) = client.send(again)
+                {
+                    return Ok(Err(error));
+                }
+                if let FromRobot::Hello(hello) = &message
+                    && let Err(error) = subscribe(client, hello)
                 {
                     return Ok(Err(error));
                 }
