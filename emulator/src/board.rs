@@ -297,9 +297,10 @@ struct Vcp {
 impl Store for Vcp {}
 
 impl Peer for Vcp {
-    fn receive(&mut self, word: u16, _: &mut Timeline<'_, '_>) {
+    fn receive(&mut self, word: u16, context: &mut Timeline<'_, '_>) {
+        let now_us = context.now().0 / 1000;
         if let Ok(mut room) = self.shared.lock() {
-            room.vcp.from_board.push(word as u8);
+            room.vcp.take(word as u8, now_us);
         }
     }
 

@@ -1,5 +1,7 @@
 //! `cargo xtask emulate` runs this.
 
+mod page;
+
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -10,13 +12,15 @@ use comfy_table::{Table, presets};
 use emulator::fault::Fault;
 use emulator::report::{self, Judged};
 use emulator::run::{Outcome, Plan, Seen, run_with};
-use emulator::vcp::{self, FarEnd, Nobody, Socket};
+use emulator::vcp::{self, FarEnd, Hold, Nobody, Socket};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use lineslam::emulated::{IS_OVER, PORT_IS};
 use lineslam::output::svg::{self, Picture, Scene};
 use lineslam::output::{self, csv, tum};
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
 use lineslam::sim::{SimConfig, judge};
+use page::Page;
 
 /// Runs the firmware on an emulated board in a simulated building.
 #[derive(Parser)]
@@ -55,6 +59,18 @@ struct Cli {
     /// `lineslam connect --port tcp://127.0.0.1:PORT`.
     #[arg(long, value_name = "PORT")]
     vcp: Option<u16>,
+    /// Show the drive on a page in the browser while it runs. A page that was opened stays until Ctrl-C.
+    #[arg(long, conflicts_with = "vcp")]
+    page: bool,
+    /// Do not open the page in a browser.
+    #[arg(long, requires = "page")]
+    no_open: bool,
+    /// With --vcp or --page: times as fast as a real board, or `max`. 1 with --vcp, max with --page.
+    #[arg(long, value_name = "TIMES", value_parser = speed)]
+    speed: Option<Speed>,
+    /// Belongs to the program that started it: says when the drive is over, goes on until standard input is closed, writes nothing.
+    #[arg(long, hide = true, requires = "vcp")]
+    attended: bool,
     /// Print the firmware's log as it comes.
     #[arg(long)]
     log: bool,
@@ -92,19 +108,14 @@ fn emulate(cli: &Cli) -> anyhow::Result<()> {
         faults: cli.faults.clone(),
         cycles: cli.cycles,
     };
-    let far_end: Box<dyn FarEnd> = match cli.vcp {
-        Some(port) => {
-            let socket = Socket::listen(port)?;
-            eprintln!("the virtual COM port is tcp://{}", socket.address()?);
-            Box::new(socket)
-        }
-        None => Box::new(Nobody),
-    };
-    let bar = progress_bar();
-    let (shown, with_log) = (bar.clone(), cli.log);
+    let (far_end, page) = far_end(cli, &world)?;
+    let bar = progress_bar(cli.attended);
+    let (shown, with_log, attended) = (bar.clone(), cli.log, cli.attended);
     let outcome = run_with(&plan, far_end, move |seen| match seen {
         Seen::Line(line) if with_log => shown.suspend(|| println!("{line}")),
         Seen::Line(_) => {}
+        Seen::Over if attended => println!("{IS_OVER}"),
+        Seen::Over => {}
         Seen::Progress(p) => {
             shown.set_position((p.driven * BAR as f64) as u64);
             shown.set_message(format!(
@@ -121,7 +132,48 @@ fn emulate(cli: &Cli) -> anyhow::Result<()> {
     let files = files(&world, &robot, &outcome, &judged)?;
     output::write_all(&cli.out, &files)?;
     print_summary(&judged, &outcome, &cli.out);
+    if let Some(page) = page {
+        page.stay();
+    }
     Ok(())
+}
+
+/// Times as fast as a real board; none is as fast as it goes.
+#[derive(Clone, Copy)]
+struct Speed(Option<f64>);
+
+fn speed(text: &str) -> Result<Speed, String> {
+    if text == "max" {
+        return Ok(Speed(None));
+    }
+    let number = text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0);
+    number.map(|number| Speed(Some(number))).ok_or_else(|| "expected a number above zero, or max".into())
+}
+
+/// Who is at the other end of the virtual COM port.
+fn far_end(cli: &Cli, world: &World) -> anyhow::Result<(Box<dyn FarEnd>, Option<Page>)> {
+    if cli.page {
+        let socket = Socket::listen(0, cli.speed.and_then(|speed| speed.0))?;
+        let page = Page::show(&socket, world, cli.seed, !cli.no_open)?;
+        return Ok((Box::new(socket), Some(page)));
+    }
+    let Some(port) = cli.vcp else { return Ok((Box::new(Nobody), None)) };
+    let socket = Socket::listen(port, cli.speed.unwrap_or(Speed(Some(1.0))).0)?;
+    if cli.attended {
+        end_with_input(socket.hold());
+    }
+    println!("{PORT_IS}tcp://{}", socket.address()?);
+    Ok((Box::new(socket), None))
+}
+
+/// Ends this program when standard input is closed: whoever started it has gone, in whatever way.
+fn end_with_input(hold: Hold) {
+    std::thread::spawn(move || {
+        let _hold = hold;
+        // Nothing is said there. An error is as good as an end.
+        let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+        std::process::exit(0);
+    });
 }
 
 fn files(
@@ -168,10 +220,10 @@ fn files(
     ])
 }
 
-fn progress_bar() -> ProgressBar {
+fn progress_bar(hidden: bool) -> ProgressBar {
     let style = ProgressStyle::with_template("{bar:30.cyan/dim} {percent} %  {msg}  ({elapsed})")
         .expect("the template is a constant");
-    let target = if std::io::stderr().is_terminal() {
+    let target = if std::io::stderr().is_terminal() && !hidden {
         ProgressDrawTarget::stderr()
     } else {
         ProgressDrawTarget::hidden()

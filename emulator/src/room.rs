@@ -16,6 +16,11 @@ use scip::sim::{Mode, SimulatedUrg, rates_agree};
 pub const STEP_US: u64 = 1000;
 /// The base stands until the sensor has been found.
 const PAUSE_S: f64 = 6.0;
+/// Poses that are kept where older ones are let go: of ten seconds, more than a scan takes to be sent.
+const KEPT_POSES: usize = 10_000;
+
+/// A reply with more bytes than this has a scan in it.
+const LEAST_SCAN: usize = 500;
 
 /// A scan as the sensor measured it.
 #[derive(Clone, Debug)]
@@ -46,8 +51,9 @@ pub struct Building {
     scanner: Scanner,
     first_step: f64,
     steps_per_revolution: f64,
-    /// Pose at each step so far, one ahead of now.
+    /// Pose at each step so far, one ahead of now, but for so many of the first.
     poses: Vec<Isometry2<f64>>,
+    forgotten: usize,
     ticks: [i64; 2],
     path_m: f64,
     driven_m: f64,
@@ -82,6 +88,7 @@ impl Building {
             path_m: path_length(&world),
             driven_m: 0.0,
             poses: vec![base.pose],
+            forgotten: 0,
             ticks: base.ticks(),
             base,
             world,
@@ -101,13 +108,23 @@ impl Building {
 
     /// Where `base` is, in the world.
     pub fn pose_at_us(&self, us: f64) -> Isometry2<f64> {
-        interpolate(&self.poses, us / STEP_US as f64)
+        interpolate(&self.poses, us / STEP_US as f64 - self.forgotten as f64)
+    }
+
+    /// Lets all go but the last scans, and the poses of a while. The first scan stays: there the map begins.
+    pub fn forget(&mut self, scans: usize) {
+        if let Some(last_gone) = self.scans.len().checked_sub(scans).filter(|last| *last > 1) {
+            self.scans.drain(1..last_gone);
+        }
+        let gone = self.poses.len().saturating_sub(KEPT_POSES);
+        self.poses.drain(..gone);
+        self.forgotten += gone;
     }
 
     /// Drives to one step beyond now; the encoders' edges on the way.
     pub fn advance(&mut self, now_us: u64, edges: &mut Vec<Edge>) {
-        while (self.poses.len() as u64 - 1) * STEP_US <= now_us {
-            let begin_ns = (self.poses.len() as u64 - 1) * STEP_US * 1000;
+        while self.last_step() * STEP_US <= now_us {
+            let begin_ns = self.last_step() * STEP_US * 1000;
             let before = self.base.pose.translation.vector;
             self.base.step(STEP_US as f64 * 1e-6);
             self.driven_m += (self.base.pose.translation.vector - before).norm();
@@ -126,6 +143,10 @@ impl Building {
         edges.sort_by_key(|edge| edge.at_ns);
     }
 
+    fn last_step(&self) -> u64 {
+        (self.forgotten + self.poses.len()) as u64 - 1
+    }
+
     /// Levels of the encoders' lines now.
     pub fn encoder_levels(&self) -> [[Level; 2]; 2] {
         self.ticks.map(levels)
@@ -137,9 +158,9 @@ impl Building {
         let at = |beam: usize| begin_us as f64 + (self.first_step + beam as f64) * beam_us;
         let middle_us = at(0).midpoint(at(ranges_mm.len() - 1));
         let people = self.world.people_at(middle_us * 1e-6);
-        let poses = &self.poses;
+        let (poses, forgotten) = (&self.poses, self.forgotten as f64);
         let moment = Moment { time_s: middle_us * 1e-6, carried: self.base.is_carried() };
-        let pose = |beam| interpolate(poses, at(beam) / STEP_US as f64);
+        let pose = |beam| interpolate(poses, at(beam) / STEP_US as f64 - forgotten);
         let measured = self.scanner.scan(pose, &people, moment);
         ranges_mm.copy_from_slice(&measured);
         let world_from_base = self.pose_at_us(middle_us);
@@ -172,6 +193,10 @@ pub struct Room {
     pub plugged: bool,
     /// The virtual COM port.
     pub vcp: Line,
+    /// When the last byte of each scan had come over the sensor's line, virtual microseconds.
+    pub replies_us: Vec<u64>,
+    /// Bytes of the reply that comes, and the last of them.
+    reply: (usize, u8),
     /// Draws as the port's own model does which bytes come with noise, where that is not to change them.
     pub flagged: Option<Errors>,
 }
@@ -183,6 +208,8 @@ pub struct Line {
     pub from_board: Vec<u8>,
     /// How many of these the other end has been told.
     pub told: usize,
+    /// How many there were when a frame's last byte had come, and when that was, virtual microseconds.
+    pub frames: Vec<(usize, u64)>,
     /// What is sent to it, at the bit rate of its port.
     pub to_board: VecDeque<u8>,
 }
@@ -196,6 +223,8 @@ impl Room {
             host_rate: 0,
             plugged: true,
             vcp: Line::default(),
+            replies_us: Vec::new(),
+            reply: (0, 0),
             flagged: None,
         }
     }
@@ -224,8 +253,23 @@ impl Room {
             if self.plugged && rates_agree(self.host_rate, sent.baud_rate) {
                 // What the model of the port will flip is flipped beforehand, so that noise raises its flag on a byte that is right.
                 let flipped = self.flagged.as_mut().map_or(0, |errors| errors.next(u8::BITS).flipped);
-                return Some(sent.byte ^ flipped as u8);
+                let byte = sent.byte ^ flipped as u8;
+                self.note_reply(byte, now_us);
+                return Some(byte);
             }
         }
+    }
+
+    /// A reply ends with an empty line.
+    fn note_reply(&mut self, byte: u8, now_us: u64) {
+        let (bytes, last) = self.reply;
+        if [last, byte] != [b'\n'; 2] {
+            self.reply = (bytes + 1, byte);
+            return;
+        }
+        if bytes > LEAST_SCAN {
+            self.replies_us.push(now_us);
+        }
+        self.reply = (0, 0);
     }
 }

@@ -40,6 +40,10 @@ const PRINT_US: u64 = 30_000_000;
 const LAST_LINES: usize = 20;
 /// A byte that nobody takes is lost after this, microseconds.
 const STALE_US: u64 = 2_000;
+/// A run that is held after its drive keeps no more than so many entries of the record: those of an hour.
+const HELD_ENTRIES: usize = 36_000;
+/// When it has more, it goes on with these.
+const KEPT_ENTRIES: usize = 1_000;
 
 /// What to run.
 pub struct Plan<'a> {
@@ -68,6 +72,8 @@ pub enum Seen {
     Line(LogLine),
     /// The firmware has taken in a scan.
     Progress(Progress),
+    /// The path is driven, or the time is up.
+    Over,
 }
 
 /// How far a run has come.
@@ -95,6 +101,10 @@ pub struct Outcome {
     pub scans: Vec<TrueScan>,
     /// What came over the virtual COM port.
     pub vcp: Vec<u8>,
+    /// How many bytes of it there were when a frame's last had come, and when that was, virtual microseconds.
+    pub frames: Vec<(usize, u64)>,
+    /// When the last byte of each scan had come over the sensor's line, virtual microseconds.
+    pub replies_us: Vec<u64>,
     /// Resets, by what caused them, with their virtual time in microseconds.
     pub resets: Vec<(u64, String)>,
     /// Times that the LED was switched.
@@ -152,6 +162,7 @@ pub fn run_with(
         rested_us: None,
         pressed_us: None,
         map_printed: false,
+        is_over: false,
         resets: 0,
         led: false,
         led_changes: 0,
@@ -188,6 +199,8 @@ pub fn run_with(
         log: director.lines,
         scans: std::mem::take(&mut room.building.scans),
         vcp: std::mem::take(&mut room.vcp.from_board),
+        frames: std::mem::take(&mut room.vcp.frames),
+        replies_us: std::mem::take(&mut room.replies_us),
         resets,
         led_changes: director.led_changes,
         flash_accelerated: director.flash_accelerated,
@@ -213,6 +226,7 @@ struct Director {
     rested_us: Option<u64>,
     pressed_us: Option<u64>,
     map_printed: bool,
+    is_over: bool,
     resets: usize,
     led: bool,
     led_changes: u32,
@@ -355,7 +369,13 @@ impl Director {
         }
         let due = self.limit_us.or(self.rested_us).unwrap_or(u64::MAX);
         match self.pressed_us {
+            None if now_us >= due && !self.vcp.lets_end() => {
+                self.over();
+                self.forget()?;
+                Ok(false)
+            }
             None if now_us >= due => {
+                self.over();
                 self.pressed_us = Some(now_us);
                 session.board_mut().press(stop.at, true);
                 Ok(false)
@@ -372,6 +392,27 @@ impl Director {
                 Ok(self.map_printed && now_us > pressed_us + PRESS_US)
             }
         }
+    }
+
+    /// Says so, once.
+    fn over(&mut self) {
+        if !std::mem::replace(&mut self.is_over, true) {
+            (self.see)(Seen::Over);
+        }
+    }
+
+    /// A robot may stand for days: what is long ago is let go.
+    fn forget(&mut self) -> anyhow::Result<()> {
+        if self.recorder.entries.len() > HELD_ENTRIES {
+            keep_last(&mut self.recorder.entries, KEPT_ENTRIES);
+            keep_last(&mut self.lines, KEPT_ENTRIES);
+            self.room(|room| {
+                room.vcp.forget();
+                keep_last(&mut room.replies_us, KEPT_ENTRIES);
+                room.building.forget(KEPT_ENTRIES);
+            })?;
+        }
+        Ok(())
     }
 
     fn tell(&mut self, now_us: u64) -> anyhow::Result<()> {
@@ -391,4 +432,8 @@ impl Director {
         (self.see)(Seen::Progress(Progress { now_us, driven, error_m, segments, took_us }));
         Ok(())
     }
+}
+
+fn keep_last<T>(all: &mut Vec<T>, count: usize) {
+    all.drain(..all.len().saturating_sub(count));
 }

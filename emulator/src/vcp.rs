@@ -2,6 +2,7 @@
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -18,11 +19,20 @@ use crate::room::Line;
 pub trait FarEnd: Send {
     /// Once a millisecond: what the board has sent since the last time, and what is sent to it.
     fn exchange(&mut self, now_us: u64, from_board: &[u8], to_board: &mut Vec<u8>) -> anyhow::Result<()>;
+
+    /// Whether the run may end, once the drive is over.
+    fn lets_end(&self) -> bool {
+        true
+    }
 }
 
 impl FarEnd for Box<dyn FarEnd> {
     fn exchange(&mut self, now_us: u64, from_board: &[u8], to_board: &mut Vec<u8>) -> anyhow::Result<()> {
         self.as_mut().exchange(now_us, from_board, to_board)
+    }
+
+    fn lets_end(&self) -> bool {
+        self.as_ref().lets_end()
     }
 }
 
@@ -34,6 +44,22 @@ impl Line {
         self.told = self.from_board.len();
         self.to_board.extend(to_board);
         Ok(())
+    }
+
+    /// A byte from the microcontroller.
+    pub fn take(&mut self, byte: u8, now_us: u64) {
+        let ends = byte == 0 && self.from_board.last().is_some_and(|before| *before != 0);
+        self.from_board.push(byte);
+        if ends {
+            self.frames.push((self.from_board.len(), now_us));
+        }
+    }
+
+    /// Lets go what the other end has been told.
+    pub fn forget(&mut self) {
+        self.from_board.drain(..self.told);
+        self.frames.clear();
+        self.told = 0;
     }
 
     /// As much noise as the line takes in so many microseconds.
@@ -83,7 +109,7 @@ impl FarEnd for Script {
 }
 
 /// Whoever connects to a socket of this machine, one at a time. As on a real board, nothing waits for who reads slowly: what does not
-/// fit is lost. Virtual time does not outrun the clock on the wall.
+/// fit is lost. Without a speed virtual time goes as fast as it can, and waits for a reader that is behind.
 #[derive(Debug)]
 pub struct Socket {
     listener: TcpListener,
@@ -91,20 +117,40 @@ pub struct Socket {
     /// What the socket has not taken yet of what was begun.
     rest: Vec<u8>,
     started: Instant,
+    speed: Option<f64>,
+    hold: Arc<()>,
+    /// The board has said something.
+    is_up: bool,
+}
+
+/// As long as it is there, a run goes on after its drive, with a robot that stands.
+#[derive(Clone, Debug)]
+pub struct Hold {
+    _counted: Arc<()>,
 }
 
 /// So much may wait for a reader, as in the ST-LINK and the driver of a PC.
 const WAITING: usize = 16 * 1024;
 /// Virtual time may be so far ahead.
 const AHEAD: Duration = Duration::from_millis(2);
+/// A reader is waited for no longer than this.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// It is looked at again after this.
+const AGAIN: Duration = Duration::from_millis(1);
 
 impl Socket {
-    /// On this port of 127.0.0.1, or any where it is zero.
-    pub fn listen(port: u16) -> anyhow::Result<Self> {
+    /// On this port of 127.0.0.1, or any where it is zero. The speed: times as fast as the clock on the wall.
+    pub fn listen(port: u16, speed: Option<f64>) -> anyhow::Result<Self> {
         let place = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
         let listener = TcpListener::bind(place).with_context(|| format!("--vcp: {place}"))?;
         listener.set_nonblocking(true).with_context(|| format!("--vcp: {place}"))?;
-        Ok(Self { listener, stream: None, rest: Vec::new(), started: Instant::now() })
+        let (rest, started) = (Vec::new(), Instant::now());
+        Ok(Self { listener, stream: None, rest, started, speed, hold: Arc::default(), is_up: false })
+    }
+
+    /// Has the run go on after its drive.
+    pub fn hold(&self) -> Hold {
+        Hold { _counted: self.hold.clone() }
     }
 
     /// Where it listens.
@@ -118,10 +164,17 @@ impl Socket {
         if self.rest.len() < WAITING {
             self.rest.extend(from_board);
         }
-        match stream.write(&self.rest) {
-            Ok(count) => drop(self.rest.drain(..count)),
-            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
-            Err(_) => return false,
+        let begun = Instant::now();
+        loop {
+            match stream.write(&self.rest) {
+                Ok(count) => drop(self.rest.drain(..count)),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+                Err(_) => return false,
+            }
+            if self.speed.is_some() || self.rest.len() < WAITING || begun.elapsed() > PATIENCE {
+                break;
+            }
+            std::thread::sleep(AGAIN);
         }
         let mut bytes = [0; 256];
         match stream.read(&mut bytes) {
@@ -147,12 +200,37 @@ impl FarEnd for Socket {
         if !self.pass(from_board, to_board) {
             self.stream = None;
         }
-        let ahead = Duration::from_micros(now_us).saturating_sub(self.started.elapsed());
-        if ahead > AHEAD {
-            std::thread::sleep(ahead);
+        // What comes before a board has booted is not kept for it.
+        self.is_up |= !from_board.is_empty();
+        if !self.is_up {
+            to_board.clear();
+        }
+        if let Some(speed) = self.speed {
+            let due = Duration::from_secs_f64(now_us as f64 * 1e-6 / speed);
+            let ahead = due.saturating_sub(self.started.elapsed());
+            if ahead > AHEAD {
+                std::thread::sleep(ahead);
+            }
         }
         Ok(())
     }
+
+    fn lets_end(&self) -> bool {
+        Arc::strong_count(&self.hold) == 1
+    }
+}
+
+/// All messages in what came over the port, with the instants at which their last bytes had come, virtual microseconds.
+pub fn timed_messages(bytes: &[u8], frames: &[(usize, u64)]) -> Vec<(u64, FromRobot)> {
+    let mut receiver = Receiver::<FRAME>::default();
+    let mut from = 0;
+    let mut all = Vec::new();
+    for (to, at_us) in frames {
+        let frame = bytes.get(std::mem::replace(&mut from, *to)..*to).unwrap_or(&[]);
+        let messages = frame.iter().filter_map(|byte| receiver.push(*byte).and_then(FromRobot::decode));
+        all.extend(messages.map(|message| (*at_us, message)));
+    }
+    all
 }
 
 /// All messages in what came over the port.
