@@ -98,11 +98,11 @@ pub fn emulate(arguments: &[String]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The main job, without any hardware: the hall, mapped by the firmware on the emulated board.
-pub fn demo() -> anyhow::Result<()> {
-    emulate(&["--world", "hall", "--out", "out/demo"].map(String::from))?;
-    println!("\nThe map is drawn in out/demo/map.svg.");
-    Ok(())
+/// The main job, without any hardware: the hall, mapped by the firmware on the emulated board, on a page while it drives.
+pub fn demo(no_open: bool) -> anyhow::Result<()> {
+    let no_open = no_open.then_some("--no-open");
+    let arguments = ["--world", "hall", "--out", "out/demo", "--page"].into_iter().chain(no_open);
+    emulate(&arguments.map(String::from).collect::<Vec<_>>())
 }
 
 /// Counts what each stage of the core takes, on the emulated core.

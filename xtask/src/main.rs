@@ -30,8 +30,12 @@ struct Cli {
 enum Task {
     /// Everything CI runs: format, clippy for host and target, docs, sizes, costs, all tests.
     Test,
-    /// The hall, driven round and mapped by the firmware on an emulated board; needs no hardware.
-    Demo,
+    /// The hall, driven round and mapped by the firmware on an emulated board, on a page in the browser; needs no hardware.
+    Demo {
+        /// Do not open the page in a browser. The command then ends with the drive; a page that was opened stays until Ctrl-C.
+        #[arg(long)]
+        no_open: bool,
+    },
     /// Run the firmware on an emulated board in a simulated building.
     #[command(disable_help_flag = true)]
     Emulate {
@@ -69,7 +73,7 @@ enum Task {
 fn main() -> ExitCode {
     let done = match Cli::parse().task {
         Task::Test => test::everything(),
-        Task::Demo => firmware::demo(),
+        Task::Demo { no_open } => firmware::demo(no_open),
         Task::Emulate { arguments } => firmware::emulate(&arguments),
         Task::Firmware => firmware::build(Build::Flashed).map(|elf| println!("{}", elf.display())),
         Task::Flash => firmware::flash(),
