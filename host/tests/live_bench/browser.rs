@@ -1,5 +1,7 @@
 //! A real browser: Chromium, driven over WebDriver.
 
+#![allow(dead_code)] // Each test file uses its part.
+
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
