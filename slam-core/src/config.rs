@@ -254,7 +254,7 @@ impl Default for SlamConfig {
             relocalisation: Some(RelocalisationConfig {
                 places_per_scan: 1,
                 hypotheses_per_scan: 10,
-                poses_per_scan: 13,
+                poses_per_scan: 11,
                 least_segments: 3,
                 least_support: 0.45,
                 min_support: 0.7,
