@@ -73,7 +73,7 @@ impl Page {
         let mut page =
             Self { socket, path, lines, walls, ended: false, speed: json!(null), notes, scenes: 0, next: 1 };
         let hello = page.read();
-        assert_eq!((&hello["type"], &hello["version"]), (&json!("hello"), &json!(1)));
+        assert_eq!((&hello["type"], &hello["version"]), (&json!("hello"), &json!(2)));
         page
     }
 
@@ -162,14 +162,14 @@ impl Page {
     fn order(&mut self, command: &Value) -> (bool, String) {
         self.next += 1;
         let id = self.next;
-        self.send(&json!({"type": "order", "id": id, "command": command}).to_string());
+        self.send(&json!({"order": {"id": id, "command": command}}).to_string());
         let answer = self.until("answer");
         assert_eq!(answer["id"], json!(id));
         (answer["done"].as_bool().unwrap(), answer["words"].as_str().unwrap().to_owned())
     }
 
     fn view(&mut self, at_us: u64) -> Value {
-        self.send(&json!({"type": "view", "id": 77, "at_us": at_us}).to_string());
+        self.send(&json!({"view": {"id": 77, "at_us": at_us}}).to_string());
         let view = self.until("view");
         assert_eq!((&view["id"], &view["at_us"]), (&json!(77), &json!(at_us)));
         view
@@ -333,40 +333,40 @@ fn commands_are_carried_out_and_answered_with_words() {
     let served = Served::new(simulated(Some(20.0)).start().unwrap());
     let mut page = Page::open(served.address);
     page.until_it(|page| page.path.len() > 30 && page.lines.len() > 2);
-    assert_eq!(page.order(&json!({"command": "pace", "speed": 0})), (true, "Paused.".into()));
-    assert!(page.order(&json!({"command": "freeze"})).0);
-    let (done, words) = page.order(&json!({"command": "freeze"}));
+    assert_eq!(page.order(&json!({"pace": {"speed": 0}})), (true, "Paused.".into()));
+    assert!(page.order(&json!("freeze")).0);
+    let (done, words) = page.order(&json!("freeze"));
     assert!(!done && words.contains("frozen already"), "{words}");
-    assert!(page.order(&json!({"command": "unfreeze"})).0);
-    let (done, words) = page.order(&json!({"command": "set_pose", "pose": [1e9, 0, 0]}));
+    assert!(page.order(&json!("unfreeze")).0);
+    let (done, words) = page.order(&json!({"set_pose": {"pose": [1e9, 0, 0]}}));
     assert!(!done && words.contains("no pose"), "{words}");
-    let (done, words) = page.order(&json!({"command": "ask_map"}));
+    let (done, words) = page.order(&json!("ask_map"));
     assert!(done && words.contains("lines were sent"), "{words}");
     let paused_at = page.path.len();
 
     // A pose that is set is where the next scan begins.
     let (x, y) = (page.path[paused_at - 1].1[0] + 0.05, page.path[paused_at - 1].1[1]);
     let heading = page.view(u64::MAX)["pose"][1][2].clone();
-    assert!(page.order(&json!({"command": "set_pose", "pose": [x, y, heading]})).0);
-    assert!(page.order(&json!({"command": "find_yourself"})).0);
+    assert!(page.order(&json!({"set_pose": {"pose": [x, y, heading]}})).0);
+    assert!(page.order(&json!("find_yourself")).0);
     page.until_it(|page| page.notes.iter().any(|note| note.starts_with("Find yourself: ")));
 
     // The map is forgotten: nothing stands, and a new one begins.
-    assert!(page.order(&json!({"command": "forget"})).0);
+    assert!(page.order(&json!("forget")).0);
     page.until_it(|page| page.lines.is_empty());
     assert!(page.path.is_empty());
-    assert!(page.order(&json!({"command": "pace", "speed": null})).0);
+    assert!(page.order(&json!({"pace": {"speed": null}})).0);
     page.until_it(|page| page.ended && !page.lines.is_empty());
 
     // At the end what needs scans is refused, and says why.
     for command in ["freeze", "find_yourself"] {
-        let (done, words) = page.order(&json!({"command": command}));
+        let (done, words) = page.order(&json!(command));
         assert!(!done && words.contains("has ended"), "{words}");
     }
     // It begins anew, history and all.
     let first_us = drive().1.log.scans[0].stamp_us;
     assert_ne!(page.path[0].0, first_us, "the path began where the map was forgotten");
-    assert!(page.order(&json!({"command": "restart"})).0);
+    assert!(page.order(&json!("restart")).0);
     page.until_it(|page| !page.ended && !page.path.is_empty());
     page.until_it(|page| page.ended);
     assert_eq!(page.path[0].0, first_us);
@@ -376,7 +376,7 @@ fn commands_are_carried_out_and_answered_with_words() {
 fn what_is_no_request_is_answered_and_harms_nothing() {
     let (served, feed) = own_source();
     let mut page = Page::open(served.address);
-    for nonsense in ["", "{", "[]", r#"{"type":"order","id":1,"command":{"command":"explode"}}"#, "\u{0}"] {
+    for nonsense in ["", "{", "[]", r#"{"order":{"id":1,"command":"explode"}}"#, "\u{0}"] {
         page.send(nonsense);
         let answer = page.until("answer");
         assert_eq!(answer["done"], json!(false), "{nonsense}");
@@ -414,7 +414,7 @@ fn every_source_speaks_through_the_same_door_and_ends_with_the_server() {
         order.answer(Err("The robot is being carried.".into()));
         (feed, command)
     });
-    let (done, words) = page.order(&json!({"command": "set_pose", "pose": [1.0, -2.0, 0.5]}));
+    let (done, words) = page.order(&json!({"set_pose": {"pose": [1.0, -2.0, 0.5]}}));
     assert_eq!((done, words.as_str()), (false, "The robot is being carried."));
     let (feed, command) = answering.join().unwrap();
     assert_eq!(command, lineslam::live::source::Command::SetPose { pose: [1.0, -2.0, 0.5] });
@@ -427,7 +427,7 @@ fn every_source_speaks_through_the_same_door_and_ends_with_the_server() {
     let mut page = Page::open(served.address);
     drop(feed);
     page.until_it(|page| page.notes.iter().any(|note| note.contains("source has ended")));
-    let (done, words) = page.order(&json!({"command": "restart"}));
+    let (done, words) = page.order(&json!("restart"));
     assert!(!done && words.contains("ended"), "{words}");
 }
 
@@ -511,10 +511,10 @@ fn a_robot_is_shown_and_told_what_to_do() {
     assert_eq!(page.walls.values().filter(|wall| **wall).count(), 20);
     assert!(page.path.iter().all(|(_, at)| *at == [0.5, -0.25]));
     assert!(page.path.windows(2).all(|two| two[0].0 < two[1].0));
-    assert!(page.order(&json!({"command": "freeze"})).0);
-    let (done, words) = page.order(&json!({"command": "set_pose", "pose": [1e9, 0, 0]}));
+    assert!(page.order(&json!("freeze")).0);
+    let (done, words) = page.order(&json!({"set_pose": {"pose": [1e9, 0, 0]}}));
     assert!(!done && words.contains("a number makes no sense"), "{words}");
-    assert!(!page.order(&json!({"command": "pace", "speed": 2})).0, "a robot is not paced");
+    assert!(!page.order(&json!({"pace": {"speed": 2}})).0, "a robot is not paced");
     drop(page);
     drop(served);
     let requests = robot.join().unwrap();

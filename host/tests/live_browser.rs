@@ -62,7 +62,7 @@ fn a_simulated_drive_is_drawn_followed_to_its_end_and_scrubbed() {
     assert_eq!(browser.eval("return document.getElementById('state').textContent;"), json!("Tracking"));
 
     // To the end, as fast as it goes.
-    browser.eval("lineslam.link.order({ command: 'pace', speed: null });");
+    browser.eval("lineslam.link.order({ pace: { speed: null } });");
     browser.until("lineslam.model.playback.ended");
     browser.click("#fit");
     let (_, drive) = drive();
@@ -147,7 +147,7 @@ fn the_page_survives_the_servers_restart_and_says_what_is_old() {
     let address = served.address;
     browser.goto(&served.url());
     browser.until("lineslam.link.connected && lineslam.model.about");
-    browser.eval("lineslam.mark = 'the same page'; lineslam.link.order({ command: 'pace', speed: 20 });");
+    browser.eval("lineslam.mark = 'the same page'; lineslam.link.order({ pace: { speed: 20 } });");
     browser.until("lineslam.model.now.trail.length > 60");
     drop(served);
     let words = browser
@@ -155,7 +155,7 @@ fn the_page_survives_the_servers_restart_and_says_what_is_old() {
     assert!(words.as_str().unwrap().contains("No connection to lineslam"), "{words}");
     browser.until("document.getElementById('notice').textContent.includes('old')");
     browser.screenshot("connection-lost");
-    let (done, words) = order(&browser, &json!({ "command": "freeze" }));
+    let (done, words) = order(&browser, &json!("freeze"));
     assert!(!done && words.contains("no connection"), "{words}");
 
     let _served = Served::at(address, simulated(None).start().unwrap());
@@ -267,7 +267,7 @@ fn another_site_can_neither_show_the_page_nor_command_the_robot() {
     let page = format!(
         r#"<!doctype html><title>other</title><iframe src="http://{own}/"></iframe><script>
         const s = new WebSocket("ws://{own}/ws");
-        s.onopen = () => {{ s.send('{{"type":"order","id":1,"command":{{"command":"forget"}}}}'); document.title = "open"; }};
+        s.onopen = () => {{ s.send('{{"order":{{"id":1,"command":"forget"}}}}'); document.title = "open"; }};
         s.onerror = () => {{ document.title = "refused"; }};
         fetch("http://{own}/map.dxf").then(() => {{ window.read = "read"; }}, () => {{ window.read = "refused"; }});
         </script>"#

@@ -20,13 +20,14 @@ use super::source::{About, Answer, Command, Event, Line, Note, Places, Playback,
 use super::status::{Counted, Fact, Status, Trouble};
 
 /// Version of the messages: a page that was loaded from another version loads itself again.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// Points of the path in a view: enough for any screen.
 const VIEW_PATH_POINTS: usize = 4000;
 
-/// From the page.
+/// From the page, as `{"order": {…}}`: an enum that is told by a field inside (`tag`) could not be read where another crate
+/// of the build asks `serde_json` for numbers of any precision.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
     /// Do this.
     Order {
@@ -312,21 +313,21 @@ mod tests {
     #[test]
     fn requests_are_read_strictly() {
         let read = |text: &str| serde_json::from_str::<Request>(text);
-        let order = read(r#"{"type":"order","id":7,"command":{"command":"set_pose","pose":[1,2.5,-0.1]}}"#);
+        let order = read(r#"{"order":{"id":7,"command":{"set_pose":{"pose":[1,2.5,-0.1]}}}}"#);
         assert_eq!(
             order.unwrap(),
             Request::Order { id: 7, command: Command::SetPose { pose: [1.0, 2.5, -0.1] } }
         );
-        let fast = read(r#"{"type":"order","id":1,"command":{"command":"pace","speed":null}}"#).unwrap();
+        let fast = read(r#"{"order":{"id":1,"command":{"pace":{"speed":null}}}}"#).unwrap();
         assert_eq!(fast, Request::Order { id: 1, command: Command::Pace { speed: None } });
         for bad in [
             "",
             "{}",
-            r#"{"type":"order","id":7}"#,
-            r#"{"type":"order","id":7,"command":{"command":"fly"}}"#,
-            r#"{"type":"order","id":7,"command":{"command":"set_pose","pose":[1,2]}}"#,
-            r#"{"type":"view","id":1,"at_us":-4}"#,
-            r#"{"type":"view","id":1,"at_us":4,"more":1}"#,
+            r#"{"order":{"id":7}}"#,
+            r#"{"order":{"id":7,"command":"fly"}}"#,
+            r#"{"order":{"id":7,"command":{"set_pose":{"pose":[1,2]}}}}"#,
+            r#"{"view":{"id":1,"at_us":-4}}"#,
+            r#"{"view":{"id":1,"at_us":4,"more":1}}"#,
         ] {
             assert!(read(bad).is_err(), "{bad}");
         }

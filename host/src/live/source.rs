@@ -180,7 +180,7 @@ pub struct Playback {
 
 /// What a source can be told.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(tag = "command", rename_all = "snake_case", deny_unknown_fields)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Command {
     /// Forget the map and begin a new one.
     Forget,

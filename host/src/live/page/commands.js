@@ -34,14 +34,14 @@ export function watchCommands(model, link, tools) {
     button.addEventListener("click", async () => {
       if (name === "set_pose") {
         delete document.body.dataset.panel;
-        tools.setPose((pose) => give({ command: "set_pose", pose }));
+        tools.setPose((pose) => give({ set_pose: { pose } }));
         return;
       }
       const question = QUESTIONS[name];
       if (question && !(await confirmed(question, model.about?.kind))) return;
       const mapping = model.now.status?.mapping ?? true;
       button.disabled = true;
-      await give({ command: name === "freeze" && !mapping ? "unfreeze" : name });
+      await give(name === "freeze" && !mapping ? "unfreeze" : name);
       button.disabled = false;
     });
   }

@@ -1,6 +1,6 @@
 // The WebSocket: connects again by itself, answers orders, and asks for one view at a time.
 
-const VERSION = 1;
+const VERSION = 2;
 const FIRST_WAIT_MS = 400;
 const LONGEST_WAIT_MS = 8000;
 /** The server says something each second. */
@@ -31,7 +31,7 @@ export class Link extends EventTarget {
   order(command) {
     if (!this.connected) return Promise.resolve({ done: false, words: "There is no connection to the server." });
     const id = this.#next++;
-    this.#send({ type: "order", id, command });
+    this.#send({ order: { id, command } });
     return new Promise((resolve) => {
       const timer = setTimeout(() => this.#settle(id, false, "No answer came."), ANSWER_MS);
       this.#orders.set(id, { resolve, timer });
@@ -53,7 +53,7 @@ export class Link extends EventTarget {
   #askView() {
     if (this.#wanted === null || this.#asked !== null || !this.connected) return;
     this.#asked = this.#next++;
-    this.#send({ type: "view", id: this.#asked, at_us: this.#wanted });
+    this.#send({ view: { id: this.#asked, at_us: this.#wanted } });
     this.#wanted = null;
   }
 

@@ -89,7 +89,7 @@ export class Timeline {
   }
 
   async #pace(speed) {
-    const { done, words } = await this.#link.order({ command: "pace", speed });
+    const { done, words } = await this.#link.order({ pace: { speed } });
     if (!done) toast(words, "warning");
   }
 
