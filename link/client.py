@@ -39,7 +39,7 @@ def show(body):
     elif kind == 6:
         print("ticks", f.number(), f.number(), f.signed(), f.signed(), "and", f.number(), "more")
     elif kind == 7:
-        number, at_us, beams, first, count, bits = (f.number() for _ in range(6))
+        number, at_us, revolution_us, beams, first, count, bits = (f.number() for _ in range(7))
         packed = int.from_bytes(f.take(f.number()), "little")
         print("ranges", number, first, *(packed >> bits * k & (1 << bits) - 1 for k in range(count)))
 

@@ -13,6 +13,7 @@ pub mod live;
 pub mod log;
 pub mod map_file;
 pub mod output;
+pub mod recording;
 pub mod replay;
 pub mod score;
 pub mod serial;

@@ -6,7 +6,7 @@ mod commands;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use commands::{benchmark, calibrate, connect, experiments, live, replay, scan, score, simulate};
+use commands::{benchmark, calibrate, connect, experiments, live, record, replay, scan, score, simulate};
 use lineslam::benchmark::BenchmarkError;
 use lineslam::calibrate::CalibrationError;
 use lineslam::emulated::EmulationError;
@@ -42,6 +42,8 @@ enum Command {
     Experiments(experiments::Args),
     /// See what the robot does, and tell it what to do.
     Connect(connect::Args),
+    /// Record what the robot says: scans, wheels, poses and events, for replay, calibrate, ROS and Foxglove.
+    Record(record::Args),
     /// Watch a log or a simulated drive being mapped, in the browser.
     Live(live::Args),
     /// Ask a sensor on a serial port who it is and draw one of its scans.
@@ -57,6 +59,7 @@ fn main() -> ExitCode {
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Experiments(args) => experiments::run(&args),
         Command::Connect(args) => connect::run(&args),
+        Command::Record(args) => record::run(&args),
         Command::Live(args) => live::run(&args),
         Command::Scan(args) => scan::run(&args),
     };

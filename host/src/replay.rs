@@ -1,10 +1,14 @@
 //! A log through the core: what the robot would have known, scan by scan.
 
+mod follow;
 mod run;
 
 use std::time::Duration;
 
+pub use follow::Agreement;
+use follow::ROBOT_TRACK;
 use nalgebra::Isometry2;
+use run::TRACK;
 pub use run::{Run, Taken};
 use slam_core::capacity::{PLACES, SEGMENTS};
 use slam_core::config::ConfigError;
@@ -99,6 +103,8 @@ pub struct Replay {
     pub restarts_us: Vec<u64>,
     /// By how much scans were stamped late, beyond what the robot file says.
     pub delay: Option<Delay>,
+    /// How it compares with what the robot said, where that was followed.
+    pub agreement: Option<Agreement>,
     /// The robot.
     pub robot: Robot,
 }
@@ -119,6 +125,8 @@ pub struct Start {
     pub pose: Option<Isometry2<f32>>,
     /// Whether the map stays as it is.
     pub frozen: bool,
+    /// Whether, of a recording of a robot, all is done again that was done to the robot: with its robot file the same bits come out.
+    pub follows: bool,
 }
 
 /// Runs a log through the core. `progress` is called after each scan.
@@ -140,20 +148,23 @@ pub fn run_from(
     progress: impl FnMut(),
 ) -> Result<Replay, ReplayError> {
     match run::beams(log) {
-        ..=URG_BEAMS => run_sized::<URG_BEAMS>(start, log, robot, config, progress),
-        beams if beams <= MANY_BEAMS => run_sized::<MANY_BEAMS>(start, log, robot, config, progress),
-        _ => run_sized::<MOST_BEAMS>(start, log, robot, config, progress),
+        ..=URG_BEAMS if start.follows && log.course.is_some() => {
+            run_sized::<URG_BEAMS, ROBOT_TRACK>(start, log, robot, config, progress)
+        }
+        ..=URG_BEAMS => run_sized::<URG_BEAMS, TRACK>(start, log, robot, config, progress),
+        beams if beams <= MANY_BEAMS => run_sized::<MANY_BEAMS, TRACK>(start, log, robot, config, progress),
+        _ => run_sized::<MOST_BEAMS, TRACK>(start, log, robot, config, progress),
     }
 }
 
-fn run_sized<const BEAMS: usize>(
+fn run_sized<const BEAMS: usize, const K: usize>(
     start: &Start,
     log: &Log,
     robot: &Robot,
     config: SlamConfig,
     mut progress: impl FnMut(),
 ) -> Result<Replay, ReplayError> {
-    let mut run = Run::<BEAMS>::new(start, log, robot, config)?;
+    let mut run = Run::<BEAMS, K>::new(start, log, robot, config)?;
     let mut steps: Vec<Step> = Vec::with_capacity(log.scans.len());
     let mut odometry = start.pose.unwrap_or_else(Isometry2::identity);
     let mut distance_m = 0.0;
@@ -193,6 +204,7 @@ fn run_sized<const BEAMS: usize>(
         impossible_steps: mapper.counters().impossible_steps as usize,
         delay: mapper.delay(),
         restarts_us: run.restarts_us().to_vec(),
+        agreement: run.agreement(),
         robot: robot.clone(),
     })
 }

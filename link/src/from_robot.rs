@@ -8,6 +8,7 @@
 use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
+use crate::frame::BODY;
 use crate::map::{LINES, LOOPS, Line, PLACES};
 use crate::ranges::Packed;
 use crate::to_robot::Streams;
@@ -47,6 +48,11 @@ impl FromRobot {
     /// one is passed over.
     pub fn decode(body: &[u8]) -> Option<Self> {
         postcard::from_bytes(body).ok()
+    }
+
+    /// The body of its frame. None would be a message that does not fit into one; there is none.
+    pub fn encode<'a>(&self, body: &'a mut [u8; BODY]) -> Option<&'a [u8]> {
+        postcard::to_slice(self, body).ok().map(|body| &*body)
     }
 }
 
@@ -97,6 +103,19 @@ pub struct Scanner {
     pub base_from_laser: [f32; 3],
     /// Whether it hangs head down.
     pub upside_down: bool,
+    /// What was taken off the stamps of scans because they are late, microseconds.
+    pub late_us: i32,
+}
+
+/// What the wheels' ticks are worth.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Wheels {
+    /// Radii of the left and the right one, metres.
+    pub radii_m: [f32; 2],
+    /// Distance between them, metres.
+    pub track_m: f32,
+    /// Ticks of one turn.
+    pub ticks_per_turn: f32,
 }
 
 /// Who is there.
@@ -120,6 +139,8 @@ pub struct Hello {
     pub kept: KeptMap,
     /// The scanner.
     pub scanner: Scanner,
+    /// The wheels.
+    pub wheels: Wheels,
     /// What is subscribed to.
     pub streams: Streams,
 }
@@ -408,6 +429,8 @@ pub struct Ranges {
     pub number: u32,
     /// Instant of its middle beam, microseconds.
     pub at_us: u64,
+    /// One revolution of the scanner, as the robot measured it, microseconds: by it the motion within the scan is taken out.
+    pub revolution_us: u32,
     /// Ranges of the whole scan.
     pub beams: u16,
     /// The beam that is the first of these.

@@ -46,6 +46,7 @@ fn the_worked_examples() {
     let ranges = link::from_robot::Ranges {
         number: 5,
         at_us: 1_050_000,
+        revolution_us: 100_000,
         beams: 682,
         first: 98,
         ranges: Packed::of(&[1000, 1005, 0, 4095]),

@@ -36,7 +36,8 @@ fn the_python_client_understands_the_robot_and_is_understood() {
 
     let mut sender = Sender::default();
     let ranges_mm: Vec<u16> = (0..98).map(|k| 5 + k * 57).collect();
-    let ranges = Ranges { number: 4, at_us: 9, beams: 682, first: 196, ranges: Packed::of(&ranges_mm) };
+    let ranges = Packed::of(&ranges_mm);
+    let ranges = Ranges { number: 4, at_us: 9, revolution_us: 100_000, beams: 682, first: 196, ranges };
     let FromRobot::Pose(pose) = &largest()[1] else { unreachable!() };
     let pose = link::from_robot::Pose { number: 4, at_us: 77_000_123, pose: [1.25, -2.5, 0.125], ..*pose };
     for message in largest().into_iter().chain([FromRobot::Pose(pose), FromRobot::Ranges(ranges)]) {

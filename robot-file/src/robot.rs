@@ -176,7 +176,7 @@ impl Robot {
     pub fn usual_for(format: &str) -> Self {
         let (text, name) = match format {
             "mines" => (include_str!("../../robots/mines.toml"), "robots/mines.toml"),
-            "simulated" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
+            "simulated" | "robot" => (include_str!("../../robots/paper.toml"), "robots/paper.toml"),
             _ => (include_str!("../../robots/sick.toml"), "robots/sick.toml"),
         };
         let robot = Self::parse(text, Path::new(name)).expect("the built-in robots are tested");

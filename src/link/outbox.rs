@@ -161,7 +161,8 @@ impl Outbox {
     pub(super) fn subscribe(&mut self, streams: Streams, samples: u32) {
         let begins = |stream| streams.has(stream) && !self.streams.has(stream);
         if begins(Streams::TICKS) {
-            self.samples = samples;
+            // With all that the record still has: who subscribes as soon as the robot has started misses none.
+            self.samples = samples.saturating_sub(SAMPLES as u32);
         }
         if begins(Streams::MAP) {
             self.map = MapCursor::new();
@@ -285,7 +286,7 @@ impl Outbox {
         let is_last = some.len() == rest.len();
         self.sending = (!is_last).then_some(Sending { number, next: next + some.len() });
         let (beams, first) = (ranges_mm.len() as u16, next as u16);
-        let at_us = scan?.middle_us;
-        Some(Ranges { number, at_us, beams, first, ranges: Packed::of(some) })
+        let ScanBuffer { middle_us: at_us, revolution_us, .. } = *scan?;
+        Some(Ranges { number, at_us, revolution_us, beams, first, ranges: Packed::of(some) })
     }
 }

@@ -4,7 +4,7 @@ use core::sync::atomic::Ordering;
 
 use ::link::Streams;
 use ::link::from_robot::{
-    Cause, Health, Hello, KeptMap, Pose, ResetCause, Scanner, State, Status, WheelFault,
+    Cause, Health, Hello, KeptMap, Pose, ResetCause, Scanner, State, Status, WheelFault, Wheels,
 };
 use embassy_time::Instant;
 use slam_core::geometry::pose::components;
@@ -51,6 +51,12 @@ pub fn hello(mapper: &Mapper, (reset, kept): (ResetCause, KeptMap), streams: Str
             max_mm: sensor.codes.max_mm,
             base_from_laser: components(&sensor.mounting.base_from_laser).into(),
             upside_down: sensor.mounting.upside_down,
+            late_us: robot::SCAN_DELAY_US as i32,
+        },
+        wheels: Wheels {
+            radii_m: [robot::DRIVE.left_wheel_radius_m, robot::DRIVE.right_wheel_radius_m],
+            track_m: robot::DRIVE.track_m,
+            ticks_per_turn: robot::DRIVE.ticks_per_turn,
         },
         streams,
     }

@@ -109,6 +109,13 @@ pub fn print_summary(source: &str, name: &str, out: &Path, report: &Report) {
         ),
         ("RAM of Slam", format!("{} bytes", report.slam_bytes)),
     ];
+    if let Some(agreement) = &report.as_the_robot {
+        let words = format!(
+            "{} poses bit for bit, {} others; {} that cannot be compared",
+            agreement.same, agreement.different, agreement.unknown
+        );
+        rows.push(("as the robot had them", words));
+    }
     if let Some(odometry) = report.odometry.as_ref().filter(|odometry| odometry.delay_used) {
         let beyond = "beyond scan_delay_s of the robot file; used";
         rows.push((

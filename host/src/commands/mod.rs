@@ -7,6 +7,7 @@ pub mod connect;
 pub mod experiments;
 pub mod live;
 pub mod log_args;
+pub mod record;
 pub mod replay;
 pub mod scan;
 pub mod score;

@@ -46,6 +46,8 @@ impl StartArgs {
     pub fn start(&self, pose: Option<Isometry2<f32>>) -> Result<Start, MapFileError> {
         self.check()?;
         let map = self.map.as_deref().map(MapFile::load).transpose()?;
-        Ok(Start { map, pose, frozen: self.localise })
+        // In another map, or with another algorithm, what the robot did is not to be had.
+        let follows = map.is_none() && self.config == Configuration::Default;
+        Ok(Start { map, pose, frozen: self.localise, follows })
     }
 }

@@ -57,6 +57,7 @@ pub fn of_drive(log: &Log, robot: &Robot, replay: &Replay) -> Vec<Warning> {
         let message = "the log has no odometry: the robot is followed by its scanner alone";
         warnings.push(Warning::new(NO_ODOMETRY, message));
     }
+    warnings.extend(unlike_the_robot(robot, replay));
     warnings.extend(wheel_fault(&replay.steps));
     if let Some(first) = replay.restarts_us.first() {
         let at = at_s(&replay.steps, *first);
@@ -79,6 +80,18 @@ pub fn of_drive(log: &Log, robot: &Robot, replay: &Replay) -> Vec<Warning> {
     }
     warnings.extend(of_tracking(&Tracking::of(&replay.steps), !log.odometry.is_empty()));
     warnings
+}
+
+/// Poses that are not those of the robot that recorded the drive, though nothing is missing from the recording.
+fn unlike_the_robot(robot: &Robot, replay: &Replay) -> Option<Warning> {
+    let agreement = replay.agreement?;
+    let first = agreement.first_different?;
+    let file = if robot.usual { ": give its robot file with --robot" } else { "" };
+    let message = format!(
+        "the poses are not those that the robot had, from its pose {first} on: robot file or firmware are others than the robot \
+         runs{file}"
+    );
+    Some(Warning::new("unlike_the_robot", message))
 }
 
 /// What the core itself found wrong.

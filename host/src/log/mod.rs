@@ -17,6 +17,7 @@ mod mines;
 mod plain;
 
 pub mod records;
+mod robot;
 pub mod ros;
 mod text;
 
@@ -27,7 +28,9 @@ use std::path::Path;
 pub use error::{Defect, LogError, Place, Warning};
 
 pub use plain::render as plain_text;
+pub(crate) use plain::{header as plain_header, line as plain_line};
 pub use records::Records;
+pub use robot::Course;
 
 use crate::robot::{Robot, ScanLayout, StatedGeometry, Wheels};
 
@@ -185,6 +188,8 @@ pub struct Log {
     pub warnings: Vec<Warning>,
     /// Format it was read as.
     pub format: &'static str,
+    /// What was done to the robot that recorded it, where it said so: with it a replay computes the bits that the robot computed.
+    pub course: Option<Course>,
 }
 
 impl Log {

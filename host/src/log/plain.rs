@@ -166,23 +166,15 @@ pub fn render(log: &Log, robot: &Robot) -> String {
     let sensor = robot.sensor_for(&log.layout(0));
     let (codes, mounting) = (sensor.codes, sensor.mounting);
     let c = slam_core::geometry::pose::components(&mounting.base_from_laser);
-    let header = Header {
-        lineslam_log: VERSION,
-        robot: Some(robot.name.clone()),
-        sensor: Some(PlainSensor {
-            first_bearing_deg: sensor.geometry.bearing(0).to_degrees(),
-            step_deg: sensor.geometry.step_rad().to_degrees(),
-            revolution_s: sensor.geometry.revolution_us as f32 * 1e-6,
-            min_range_m: Some(f32::from(codes.min_mm) * 1e-3),
-            max_range_m: Some(f32::from(codes.max_mm.saturating_add(1)) * 1e-3),
-            mounting: Some([c.x, c.y, c.z.to_degrees()]),
-            upside_down: mounting.upside_down,
-        }),
-        wheels: robot.wheels,
+    let stated = StatedGeometry {
+        first_bearing_rad: sensor.geometry.bearing(0),
+        step_rad: sensor.geometry.step_rad(),
+        revolution_s: sensor.geometry.revolution_us as f32 * 1e-6,
+        limits_m: Some([codes.min_mm, codes.max_mm.saturating_add(1)].map(|mm| f32::from(mm) * 1e-3)),
+        base_from_laser: Some([c.x, c.y, c.z]),
+        upside_down: mounting.upside_down,
     };
-    // Numbers and names always have a form in JSON.
-    let mut text = serde_json::to_string(&header).unwrap_or_default();
-    text.push('\n');
+    let mut text = header(&robot.name, &stated, robot.wheels);
     let mut odometry = log.odometry.iter().peekable();
     for scan in &log.scans {
         while let Some((stamp_us, reading)) = odometry.next_if(|(stamp_us, _)| *stamp_us < scan.stamp_us) {
@@ -195,7 +187,30 @@ pub fn render(log: &Log, robot: &Robot) -> String {
     text
 }
 
-fn line(text: &mut String, stamp_us: u64, odometry: Option<&Odometry>, ranges_mm: Option<&[u16]>) {
+/// The first line.
+pub fn header(robot: &str, stated: &StatedGeometry, wheels: Option<Wheels>) -> String {
+    let header = Header {
+        lineslam_log: VERSION,
+        robot: Some(robot.to_owned()),
+        sensor: Some(PlainSensor {
+            first_bearing_deg: stated.first_bearing_rad.to_degrees(),
+            step_deg: stated.step_rad.to_degrees(),
+            revolution_s: stated.revolution_s,
+            min_range_m: stated.limits_m.map(|[least, _]| least),
+            max_range_m: stated.limits_m.map(|[_, most]| most),
+            mounting: stated.base_from_laser.map(|[x, y, yaw]| [x, y, yaw.to_degrees()]),
+            upside_down: stated.upside_down,
+        }),
+        wheels,
+    };
+    // Numbers and names always have a form in JSON.
+    let mut text = serde_json::to_string(&header).unwrap_or_default();
+    text.push('\n');
+    text
+}
+
+/// Any other line.
+pub fn line(text: &mut String, stamp_us: u64, odometry: Option<&Odometry>, ranges_mm: Option<&[u16]>) {
     // Writing to a String cannot fail.
     let _ = write!(text, "{{\"t_us\":{stamp_us}");
     let _ = match odometry {

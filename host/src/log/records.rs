@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::robot::Course;
 use super::{Odometry, Warning};
 use crate::robot::{StatedGeometry, Wheels};
 
@@ -63,6 +64,8 @@ pub struct Records {
     pub skipped: BTreeMap<&'static str, usize>,
     /// What the user should know.
     pub warnings: Vec<Warning>,
+    /// What was done to the robot that recorded it, where it said so.
+    pub course: Option<Course>,
 }
 
 impl Records {

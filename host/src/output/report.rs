@@ -11,7 +11,7 @@ use slam_core::tracking::correction::Verdict;
 
 use super::tracking::Tracking;
 use crate::log::{Log, Warning, doubts};
-use crate::replay::Replay;
+use crate::replay::{Agreement, Replay};
 use crate::robot::Robot;
 use crate::sim::judge::{self, Judgement, LaidCorners, TrajectoryErrors};
 use crate::sim::world::World;
@@ -46,6 +46,8 @@ pub struct Report {
     pub tracking: Tracking,
     /// What was found out about the odometry, where there is one.
     pub odometry: Option<OdometryReport>,
+    /// How the poses compare with those that the robot said, where it recorded them itself.
+    pub as_the_robot: Option<Agreement>,
     /// Counters of the core.
     pub counters: Counters,
     /// Counters of the map.
@@ -191,6 +193,7 @@ impl Report {
                 delay_sigma_s: delay.sigma_s,
                 delay_used: delay.used,
             }),
+            as_the_robot: replay.agreement,
             counters: replay.counters,
             map_counters: replay.map_counters,
             slam_bytes: replay.slam_bytes,

@@ -8,12 +8,13 @@ use slam_core::geometry::pose::pose;
 use slam_core::odometry::{DifferentialDrive, Increment, OdometryNoise};
 use slam_core::{Mapper, ScanMotion, SlamConfig, SlamUpdate, WheelTicks};
 
+use super::follow::{Agreement, Followed, Follower};
 use super::{MOST_BEAMS, ReplayError, Start};
 use crate::log::{Log, Odometry};
 use crate::robot::{Robot, Wheels};
 
 /// Odometry samples held, which must span the sweep of a scan.
-const TRACK: usize = 256;
+pub(super) const TRACK: usize = 256;
 /// Where there is no odometry a robot of [unknown speed](slam_core::mapper::UNKNOWN_SPEED) makes the pose this unsure: between scans
 /// 0.1 s apart by a decimetre and six degrees. Chosen on one log, of a scanner carried by hand (ccny_demo).
 const UNKNOWN_MOTION: OdometryNoise = OdometryNoise {
@@ -32,15 +33,18 @@ pub(super) fn beams(log: &Log) -> usize {
     log.scans.iter().map(|s| s.ranges_mm.len()).max().unwrap_or(0)
 }
 
-/// A log on its way through the core, scan by scan. Room for `BEAMS` beams.
-pub struct Run<'a, const BEAMS: usize = MOST_BEAMS> {
+/// A log on its way through the core, scan by scan. Room for `BEAMS` beams and `K` samples of the odometry.
+pub struct Run<'a, const BEAMS: usize = MOST_BEAMS, const K: usize = TRACK> {
     log: &'a Log,
     robot: &'a Robot,
     config: SlamConfig,
     feed: OdometryFeed<'a>,
     next: usize,
+    /// Where what was done to the robot that recorded the log is done again.
+    follower: Option<Follower<'a>>,
+    drive: Option<DifferentialDrive>,
     /// What the robot has aboard. Between scans it can be told what a robot can be told.
-    pub mapper: Box<Mapper<SEGMENTS, TRACK, BEAMS, PLACES>>,
+    pub mapper: Box<Mapper<SEGMENTS, K, BEAMS, PLACES>>,
 }
 
 /// What came of a scan.
@@ -56,7 +60,7 @@ pub struct Taken {
     pub took: Duration,
 }
 
-impl<'a, const BEAMS: usize> Run<'a, BEAMS> {
+impl<'a, const BEAMS: usize, const K: usize> Run<'a, BEAMS, K> {
     /// Before the first scan.
     pub fn new(
         start: &Start,
@@ -74,13 +78,19 @@ impl<'a, const BEAMS: usize> Run<'a, BEAMS> {
             config.odometry.noise = UNKNOWN_MOTION;
             (config.odometry.bias, config.odometry.delay) = (None, None);
         }
-        let mut mapper = new_mapper(robot, config)?;
+        let follower = log.course.as_ref().filter(|_| start.follows).map(Follower::new);
+        let drive = match (&follower, robot.wheels.zip(robot.drive())) {
+            // A robot counts in 32 bits itself.
+            (Some(_), wheels) => wheels.map(|(_, drive)| drive),
+            (None, wheels) => wheels.map(|(wheels, drive)| drive_of_counters(&wheels, drive)),
+        };
+        let mut mapper = new_mapper(robot, config, drive)?;
         if let Some(map) = &start.map {
             map.hand_to(&mut mapper, start.pose)?;
         }
         mapper.set_mapping(!start.frozen);
         let feed = OdometryFeed::new(log, robot)?;
-        Ok(Self { log, robot, config, feed, next: 0, mapper })
+        Ok(Self { log, robot, config, feed, next: 0, follower, drive, mapper })
     }
 
     /// The configuration that it began with, robot included.
@@ -93,6 +103,11 @@ impl<'a, const BEAMS: usize> Run<'a, BEAMS> {
         &self.feed.restarts_us
     }
 
+    /// How what was followed so far compares with what the robot said, if that is done.
+    pub fn agreement(&self) -> Option<Agreement> {
+        self.follower.as_ref().map(Follower::agreement)
+    }
+
     /// Stamp of the next scan, microseconds; `None` at the end.
     pub fn next_us(&self) -> Option<u64> {
         self.log.scans.get(self.next).map(|scan| scan.stamp_us)
@@ -100,12 +115,28 @@ impl<'a, const BEAMS: usize> Run<'a, BEAMS> {
 
     /// Forgets map, pose and counters; the log goes on.
     pub fn forget(&mut self) -> Result<(), ReplayError> {
-        self.mapper = new_mapper(self.robot, self.config)?;
+        self.mapper = new_mapper(self.robot, self.config, self.drive)?;
         Ok(())
     }
 
     /// Hands the next scan to the core, with the odometry up to there; `None` at the end.
     pub fn step(&mut self) -> Result<Option<Taken>, ReplayError> {
+        if let Some(follower) = &mut self.follower {
+            let anew = || new_mapper(self.robot, self.config, self.drive);
+            while let Some(Followed { place, motion, update, took }) =
+                follower.step(&mut self.mapper, anew)?
+            {
+                // One whose stamp was not later than the one before is not among them.
+                let rest = self.log.scans.get(self.next..).unwrap_or_default();
+                if let Some(ahead) = rest.iter().position(|scan| scan.line == place) {
+                    let scan = self.next + ahead;
+                    self.next = scan + 1;
+                    return Ok(Some(Taken { scan, motion, update, took }));
+                }
+            }
+            self.next = self.log.scans.len();
+            return Ok(None);
+        }
         let Some(scan) = self.log.scans.get(self.next) else { return Ok(None) };
         let index = self.next;
         self.next += 1;
@@ -129,12 +160,11 @@ fn refused(robot: &Robot) -> impl FnOnce(ConfigError) -> ReplayError {
     |source| ReplayError::Config { robot: robot.name.clone(), source }
 }
 
-fn new_mapper<const BEAMS: usize>(
+fn new_mapper<const BEAMS: usize, const K: usize>(
     robot: &Robot,
     config: SlamConfig,
-) -> Result<Box<Mapper<SEGMENTS, TRACK, BEAMS, PLACES>>, ReplayError> {
-    let wheels = robot.wheels.zip(robot.drive());
-    let drive = wheels.map(|(wheels, drive)| drive_of_counters(&wheels, drive));
+    drive: Option<DifferentialDrive>,
+) -> Result<Box<Mapper<SEGMENTS, K, BEAMS, PLACES>>, ReplayError> {
     Mapper::new(config, drive).map(Box::new).map_err(refused(robot))
 }
 
@@ -172,9 +202,9 @@ impl<'a> OdometryFeed<'a> {
     }
 
     /// Feeds samples until one lies at or after `until_us`.
-    fn advance<const BEAMS: usize>(
+    fn advance<const BEAMS: usize, const K: usize>(
         &mut self,
-        mapper: &mut Mapper<SEGMENTS, TRACK, BEAMS, PLACES>,
+        mapper: &mut Mapper<SEGMENTS, K, BEAMS, PLACES>,
         until_us: u64,
     ) {
         while self.last.is_none_or(|(logged_us, _)| logged_us + STAMP_OFFSET_US < until_us)

@@ -137,6 +137,7 @@ fn hello() -> Hello {
         reset: ResetCause::Pin,
         kept: KeptMap::Whole,
         scanner: Scanner { beams: 682, ..Scanner::default() },
+        wheels: Wheels::default(),
         streams: Streams::DEFAULT,
     }
 }

@@ -40,7 +40,9 @@ pub fn largest() -> [FromRobot; 12] {
                 max_mm: u16::MAX,
                 base_from_laser: [far; 3],
                 upside_down: true,
+                late_us: i32::MIN,
             },
+            wheels: Wheels { radii_m: [far; 2], track_m: far, ticks_per_turn: far },
             streams: Streams(u16::MAX),
         }),
         FromRobot::Pose(Pose {
@@ -83,6 +85,7 @@ pub fn largest() -> [FromRobot; 12] {
         FromRobot::Ranges(Ranges {
             number: most,
             at_us: u64::MAX,
+            revolution_us: most,
             beams: u16::MAX,
             first: u16::MAX,
             ranges: Packed::of(&[u16::MAX; RANGES]),

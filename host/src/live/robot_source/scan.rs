@@ -81,6 +81,7 @@ mod tests {
             max_mm: 5600,
             base_from_laser: [0.1, 0.0, 0.0],
             upside_down: false,
+            late_us: 0,
         };
         let pose = Pose {
             number: 7,
@@ -96,6 +97,7 @@ mod tests {
         let part = |number, first, ranges: &[u16]| Ranges {
             number,
             at_us: 1,
+            revolution_us: 100_000,
             beams: 3,
             first,
             ranges: Packed::of(ranges),

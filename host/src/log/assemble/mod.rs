@@ -14,7 +14,7 @@ use std::path::Path;
 use slam_core::config::MOST_OF_A_TURN;
 
 use super::records::{Records, ScanRecord};
-use super::{Defect, Format, Log, LogError, ReadOptions, Warning};
+use super::{Defect, Format, Log, LogError, ReadOptions, Warning, robot};
 
 /// No scanner of a building sees this far half of the time, millimetres, …
 const MOST_MEDIAN_MM: f64 = 200e3;
@@ -39,12 +39,20 @@ pub fn log(
     records: Records,
     options: &ReadOptions<'_>,
 ) -> Result<Log, LogError> {
-    let Records { scans, odometry, geometries, wheels, distances, skipped, warnings } = records;
+    let Records { scans, odometry, geometries, wheels, distances, skipped, warnings, course } = records;
     let mut assembly = Assembly {
         path,
         format,
         options,
-        log: Log { geometries, wheels, skipped, warnings, format: format.name(), ..Log::default() },
+        log: Log {
+            geometries,
+            wheels,
+            skipped,
+            warnings,
+            format: if course.is_some() { robot::FORMAT } else { format.name() },
+            course,
+            ..Log::default()
+        },
     };
     let in_file = scans.len() + assembly.unreadable();
     if scans.is_empty() {

@@ -11,6 +11,7 @@ use super::scan::{self, to_us};
 use super::topics::{Role, Topic};
 use super::transforms::{self, Tree};
 use crate::log::records::{OdometryRecord, Records, ScanRecord, Source};
+use crate::log::robot::RobotLog;
 use crate::log::{Defect, LogError, Odometry, Place, RangeUnit, ReadOptions, Warning};
 
 /// A topic, as the containers name it to the collector.
@@ -69,6 +70,8 @@ pub struct Collector<'a> {
     pub(super) moving: BTreeMap<(TopicId, String), Track>,
     pub(super) joints: BTreeMap<TopicId, Joints>,
     pub(super) tree: Tree,
+    /// What a robot said over its link, if that is in the file and no topic was asked for.
+    pub(super) robot: Option<RobotLog>,
 }
 
 impl<'a> Collector<'a> {
@@ -90,6 +93,7 @@ impl<'a> Collector<'a> {
             moving: BTreeMap::new(),
             joints: BTreeMap::new(),
             tree: Tree::default(),
+            robot: None,
         }
     }
 
@@ -106,16 +110,30 @@ impl<'a> Collector<'a> {
             return id;
         }
         let id = TopicId(self.topics.len());
-        let role = if encoding == Encoding::Other { Role::Other } else { Role::of(&key.1) };
+        let role = match (encoding, Role::of(&key.0, &key.1)) {
+            (Encoding::Other, _) => Role::Other,
+            (_, Role::Link) if self.asks_for_topics() => Role::Other,
+            (_, role) => role,
+        };
+        if role == Role::Link {
+            self.robot.get_or_insert_default();
+        }
         self.topics.push(Topic { name: key.0.clone(), kind: key.1.clone(), encoding, role, count: 0 });
         self.by_name.insert(key, id);
         id
+    }
+
+    fn asks_for_topics(&self) -> bool {
+        self.options.scan_topic.is_some() || self.options.odom_topic.is_some()
     }
 
     /// Whether the bytes of a topic's messages are looked at.
     pub fn wants(&self, id: TopicId) -> bool {
         self.topics.get(id.0).is_some_and(|topic| match topic.role {
             Role::Other => false,
+            Role::Link => true,
+            // The messages beside what the robot said are made of it.
+            _ if self.robot.is_some() => false,
             Role::Scan => !self.ambiguous && self.options.scan_topic.is_none_or(|name| topic.is_named(name)),
             Role::Odometry | Role::Transforms | Role::Joints => true,
         })
@@ -139,6 +157,11 @@ impl<'a> Collector<'a> {
         let Some(topic) = self.topics.get(id.0).filter(|_| wanted) else { return Ok(()) };
         let (role, encoding) = (topic.role, topic.encoding);
         match role {
+            Role::Link => {
+                if let Some(robot) = &mut self.robot {
+                    robot.take(self.messages, recorded_ns, bytes, &mut self.records);
+                }
+            }
             Role::Scan if self.ambiguous => {}
             Role::Scan => {
                 self.scan_topic = Some(id);

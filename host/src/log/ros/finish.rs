@@ -12,6 +12,10 @@ impl Collector<'_> {
     /// The records of what is chosen, and what the user should know.
     pub fn finish(mut self) -> Result<Records, LogError> {
         self.say_damage()?;
+        if let Some(robot) = self.robot.take() {
+            robot.finish(&mut self.records);
+            return Ok(self.records);
+        }
         self.check_scans()?;
         let choice = self.choose_odometry()?;
         let child = self.take_odometry(choice);

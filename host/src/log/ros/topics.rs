@@ -1,6 +1,7 @@
 //! The topics of a bag, and what each is good for.
 
 use super::messages::{Encoding, bare};
+use crate::recording::{LINK_TOPIC, LINK_TYPE};
 
 /// What a topic is good for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -13,14 +14,17 @@ pub enum Role {
     Transforms,
     /// sensor_msgs/JointState.
     Joints,
+    /// What a robot said over its link.
+    Link,
     /// Nothing here.
     Other,
 }
 
 impl Role {
-    /// By the type, without ROS 2's `msg/`.
-    pub fn of(kind: &str) -> Self {
+    /// By the name and the type, without ROS 2's `msg/`.
+    pub fn of(name: &str, kind: &str) -> Self {
         match kind {
+            LINK_TYPE if name == LINK_TOPIC => Self::Link,
             "sensor_msgs/LaserScan" => Self::Scan,
             "nav_msgs/Odometry" => Self::Odometry,
             "tf2_msgs/TFMessage" | "tf/tfMessage" => Self::Transforms,

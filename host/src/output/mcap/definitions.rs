@@ -1,10 +1,13 @@
 //! Definitions of the messages, for readers that do not know them.
 
 /// Types and their fields, as the packages of ROS 2 define them since Humble.
-const DEFINITIONS: [(&str, &str); 27] = [
+const DEFINITIONS: [(&str, &str); 31] = [
     ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
     ("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
     ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
+    ("std_msgs/UInt8MultiArray", "std_msgs/MultiArrayLayout layout\nuint8[] data\n"),
+    ("std_msgs/MultiArrayLayout", "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n"),
+    ("std_msgs/MultiArrayDimension", "string label\nuint32 size\nuint32 stride\n"),
     ("std_msgs/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"),
     ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n"),
     ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n"),
@@ -47,6 +50,11 @@ const DEFINITIONS: [(&str, &str); 27] = [
         "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
     ),
     ("sensor_msgs/CompressedImage", "std_msgs/Header header\nstring format\nuint8[] data\n"),
+    (
+        "rcl_interfaces/Log",
+        "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\nbuiltin_interfaces/Time stamp\nuint8 level\n\
+         string name\nstring msg\nstring file\nstring function\nuint32 line\n",
+    ),
     ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v\n"),
     ("visualization_msgs/MeshFile", "string filename\nuint8[] data\n"),
     ("visualization_msgs/MarkerArray", "visualization_msgs/Marker[] markers\n"),

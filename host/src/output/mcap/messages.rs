@@ -25,6 +25,8 @@ message!(OccupancyGrid, "nav_msgs/OccupancyGrid");
 message!(PoseWithCovarianceStamped, "geometry_msgs/PoseWithCovarianceStamped");
 message!(TfMessage, "tf2_msgs/TFMessage");
 message!(MarkerArray, "visualization_msgs/MarkerArray");
+message!(Log, "rcl_interfaces/Log");
+message!(Bytes, "std_msgs/UInt8MultiArray");
 
 #[derive(Clone, Copy, Serialize)]
 pub struct Time {
@@ -112,6 +114,42 @@ pub struct JointState<'a> {
     pub position: &'a [f64],
     pub velocity: &'a [f64],
     pub effort: &'a [f64],
+}
+
+/// Bytes of which ROS knows nothing.
+#[derive(Serialize)]
+pub struct Bytes<'a> {
+    /// None: labels are strings.
+    dimensions: &'a [&'a str],
+    data_offset: u32,
+    data: &'a [u8],
+}
+
+impl<'a> Bytes<'a> {
+    pub fn new(data: &'a [u8]) -> Self {
+        Self { dimensions: &[], data_offset: 0, data }
+    }
+}
+
+/// A line of a log, as `/rosout` has it.
+#[derive(Serialize)]
+pub struct Log<'a> {
+    pub stamp: Time,
+    pub level: u8,
+    pub name: &'a str,
+    pub msg: &'a str,
+    pub file: &'a str,
+    pub function: &'a str,
+    pub line: u32,
+}
+
+impl<'a> Log<'a> {
+    pub const INFO: u8 = 20;
+    pub const WARN: u8 = 30;
+
+    pub fn new(ns: u64, level: u8, msg: &'a str) -> Self {
+        Self { stamp: Time::of_ns(ns), level, name: "lineslam", msg, file: "", function: "", line: 0 }
+    }
 }
 
 #[derive(Serialize)]

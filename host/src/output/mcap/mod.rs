@@ -12,51 +12,35 @@
 //! Frames follow REP 105, ranges REP 117: +∞ where nothing was in range, NaN where nothing could be measured.
 
 mod definitions;
-mod messages;
-mod scan;
+pub(crate) mod file;
+pub(crate) mod messages;
+pub(crate) mod scan;
 
-use std::collections::{BTreeMap, HashMap};
 use std::f64::consts::PI;
 use std::io::Cursor;
 
-use byteorder::LittleEndian;
-use mcap::records::MessageHeader;
 use nalgebra::{Isometry2, Point2};
 use slam_core::MapSegment;
 
 use super::grid::Grid;
 use crate::log::{self, Log};
 use crate::replay::{ESTABLISHED_HITS, Replay, Step};
-use definitions::definition;
+pub use file::RecordingError;
+use file::{File, Seeks, header, nanoseconds};
 use messages::{
-    Colour, Covariance, Header, JointState, Marker, MarkerArray, Message, OccupancyGrid, Odometry, Path,
-    Pose, PoseStamped, PoseWithCovariance, PoseWithCovarianceStamped, TfMessage, Time, TransformStamped,
-    Vector3,
+    Colour, Covariance, JointState, Marker, MarkerArray, OccupancyGrid, Odometry, Path, Pose, PoseStamped,
+    PoseWithCovariance, PoseWithCovarianceStamped, TfMessage, Time, TransformStamped, Vector3,
 };
 use scan::{Frames, first_beam_ns, scan};
 
-const MAP: &str = "map";
+pub(crate) const MAP: &str = "map";
 const ODOM: &str = "odom";
-const BASE: &str = "base_link";
-const WHEELS: [&str; 2] = ["wheel_left_joint", "wheel_right_joint"];
-
-/// Topics whose last message whoever comes late gets too.
-const KEPT: [&str; 4] = ["/tf_static", "/path", "/map", "/segments"];
+pub(crate) const BASE: &str = "base_link";
+pub(crate) const WHEELS: [&str; 2] = ["wheel_left_joint", "wheel_right_joint"];
 
 const SEGMENT_WIDTH_M: f64 = 0.04;
 const SURE: Colour = Colour { r: 0.16, g: 0.47, b: 0.71, a: 1.0 };
 const TENTATIVE: Colour = Colour { a: 0.3, ..SURE };
-
-/// The recording could not be made.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordingError {
-    /// A message has no CDR.
-    #[error(transparent)]
-    Message(#[from] cdr_encoding::Error),
-    /// The file has no room for it.
-    #[error(transparent)]
-    File(#[from] mcap::McapError),
-}
 
 /// What is written at an instant.
 #[derive(Clone, Copy)]
@@ -76,7 +60,7 @@ pub fn render(log: &Log, replay: &Replay, grid: &Grid) -> Result<Vec<u8>, Record
     }
     events.extend(wheel_angles(log, replay).map(|(stamp_us, at)| (nanoseconds(stamp_us), Event::Wheels(at))));
     events.sort_by_key(|(ns, _)| *ns);
-    let mut recording = Recording::new()?;
+    let mut recording = File::new(Cursor::new(Vec::new()), Seeks::Back)?;
     if let Some((ns, _)) = events.first() {
         recording.write("/tf_static", *ns, &frames.message(*ns))?;
     }
@@ -102,71 +86,7 @@ pub fn render(log: &Log, replay: &Replay, grid: &Grid) -> Result<Vec<u8>, Record
         recording.write("/map", *ns, &occupancy(grid, *ns))?;
         recording.write("/segments", *ns, &segments(replay, *ns))?;
     }
-    recording.finish()
-}
-
-/// Messages on their way into the file.
-struct Recording {
-    writer: mcap::Writer<Cursor<Vec<u8>>>,
-    /// Number of each topic's channel, and its messages so far.
-    channels: HashMap<&'static str, (u16, u32)>,
-}
-
-impl Recording {
-    fn new() -> Result<Self, RecordingError> {
-        let options = mcap::WriteOptions::new()
-            .profile("ros2")
-            .library(concat!("lineslam ", env!("CARGO_PKG_VERSION")))
-            // The file shall not hang on the number of processors.
-            .compression_threads(0);
-        Ok(Self { writer: options.create(Cursor::new(Vec::new()))?, channels: HashMap::new() })
-    }
-
-    fn write<M: Message>(&mut self, topic: &'static str, ns: u64, message: &M) -> Result<(), RecordingError> {
-        let (channel_id, sequence) = match self.channels.get(topic) {
-            Some(channel) => *channel,
-            None => (self.open::<M>(topic)?, 0),
-        };
-        self.channels.insert(topic, (channel_id, sequence + 1));
-        // Little-endian CDR says so in four bytes, from behind which fields are aligned.
-        let mut bytes = vec![0, 1, 0, 0];
-        bytes.extend(cdr_encoding::to_vec::<_, LittleEndian>(message)?);
-        let header = MessageHeader { channel_id, sequence, log_time: ns, publish_time: ns };
-        Ok(self.writer.write_to_known_channel(&header, &bytes)?)
-    }
-
-    fn open<M: Message>(&mut self, topic: &str) -> Result<u16, RecordingError> {
-        let name = M::TYPE.replacen('/', "/msg/", 1);
-        let schema = self.writer.add_schema(&name, "ros2msg", definition(M::TYPE).as_bytes())?;
-        let profile = [("offered_qos_profiles".to_owned(), quality_of_service(topic))];
-        Ok(self.writer.add_channel(schema, topic, "cdr", &BTreeMap::from(profile))?)
-    }
-
-    fn finish(mut self) -> Result<Vec<u8>, RecordingError> {
-        self.writer.finish()?;
-        Ok(self.writer.into_inner().into_inner())
-    }
-}
-
-/// A topic's quality of service in the words of rosbag2, with the numbers that all its versions read: reliable, the last
-/// messages kept, for latecomers too (1) or not (2), without limits in time.
-fn quality_of_service(topic: &str) -> String {
-    let (depth, durability) = if KEPT.contains(&topic) { (1, 1) } else { (10, 2) };
-    let forever = "\n    sec: 9223372036\n    nsec: 854775807";
-    format!(
-        "- history: 1\n  depth: {depth}\n  reliability: 1\n  durability: {durability}\n  deadline:{forever}\n  \
-         lifespan:{forever}\n  liveliness: 1\n  liveliness_lease_duration:{forever}\n  \
-         avoid_ros_namespace_conventions: false"
-    )
-}
-
-/// Stamps of logs whose unit was mistaken may be too large; they stay at the largest.
-fn nanoseconds(stamp_us: u64) -> u64 {
-    stamp_us.saturating_mul(1000)
-}
-
-fn header(ns: u64, frame_id: &str) -> Header<'_> {
-    Header { stamp: Time::of_ns(ns), frame_id }
+    Ok(recording.finish()?.into_inner())
 }
 
 /// Stamps and angles of the left and right wheel, radians; none where the log has poses.
@@ -188,7 +108,7 @@ fn wheel_angles(log: &Log, replay: &Replay) -> impl Iterator<Item = (u64, [f64; 
 }
 
 /// The same pose with digits enough to be taken apart and put together again.
-fn exact(pose: &Isometry2<f32>) -> Isometry2<f64> {
+pub(crate) fn exact(pose: &Isometry2<f32>) -> Isometry2<f64> {
     let (re, im) = (f64::from(pose.rotation.re), f64::from(pose.rotation.im));
     Isometry2::new(pose.translation.vector.map(f64::from), im.atan2(re))
 }

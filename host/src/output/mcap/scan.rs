@@ -2,12 +2,13 @@
 
 use slam_core::sensor::scan::{Mounting, Reading, SensorConfig};
 
+use super::file::{header, nanoseconds};
 use super::messages::{LaserScan, Pose, TfMessage, TransformStamped};
-use super::{BASE, exact, header, nanoseconds};
+use super::{BASE, exact};
 use crate::log::Log;
 use crate::replay::Replay;
 
-const LASER: &str = "laser";
+pub(crate) const LASER: &str = "laser";
 /// Mountings that differ less, in metres and radians, are the same.
 const SAME_MOUNTING: f32 = 1e-4;
 
@@ -86,7 +87,7 @@ pub fn scan<'a>(log: &Log, replay: &Replay, frames: &'a Frames, k: usize, ns: u6
 }
 
 /// A reading as REP 117 writes it.
-fn range_m(reading: Reading, value_mm: u16) -> f32 {
+pub(crate) fn range_m(reading: Reading, value_mm: u16) -> f32 {
     match reading {
         Reading::Range(_) => metres(value_mm.into()),
         Reading::NoEcho => f32::INFINITY,
@@ -95,7 +96,7 @@ fn range_m(reading: Reading, value_mm: u16) -> f32 {
 }
 
 /// The nearest number there is, so that the millimetres can be had back.
-fn metres(mm: u32) -> f32 {
+pub(crate) fn metres(mm: u32) -> f32 {
     mm as f32 / 1000.0
 }
 
