@@ -57,9 +57,9 @@ pub fn report() -> anyhow::Result<()> {
         println!("{bytes:>9} {name}");
     }
 
-    let command = format!("build --quiet --release -p footprint --target {TARGET}");
+    let command = format!("build --quiet --profile firmware -p footprint --target {TARGET}");
     step("size of the sensor's driver alone, bytes", &mut cargo(&command))?;
-    let driver = read(&target_folder().join(TARGET).join("release/footprint"))?;
+    let driver = read(&target_folder().join(TARGET).join("firmware/footprint"))?;
     for (name, bytes) in largest(&driver.code_by_crate) {
         println!("{bytes:>9} of code in {name}");
     }
