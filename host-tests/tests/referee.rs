@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use host_tests::{data, recorded, root, skipped};
-use lineslam::benchmark::walls;
-use lineslam::log::{self, ReadOptions};
+use lineslam::benchmark::{perturbed, walls};
+use lineslam::log::{self, Log, ReadOptions};
 use lineslam::output::tum;
 use lineslam::replay;
 use lineslam::robot::Robot;
@@ -201,7 +201,7 @@ fn the_referee_agrees() {
     let test = "the_referee_agrees";
     let Some(referee) = Referee::call(test) else { return };
     let folder = tempfile::tempdir().unwrap();
-    for Thin { name, file, reference_m, thicker } in LOGS {
+    for Thin { name, file, reference_m, .. } in LOGS {
         let Some(path) = recorded(file, test) else { continue };
         let log = log::read(&path, &ReadOptions::default()).unwrap();
         let robot = Robot::usual_for(log.format);
@@ -226,7 +226,30 @@ fn the_referee_agrees() {
              reference's {reference_m:.3} m",
             ours.ate_rmse_m
         );
-        assert!(thickness_m <= thicker * reference_m, "walls of {name} are {thickness_m} m thick");
+    }
+}
+
+/// One drive may have luck or none: the median of it as it is and four times with 5 mm more noise.
+#[test]
+fn walls_are_as_thin_as_the_references_on_most_drives() {
+    let test = "walls_are_as_thin_as_the_references_on_most_drives";
+    for Thin { name, file, reference_m, thicker } in LOGS {
+        let Some(path) = recorded(file, test) else { continue };
+        let log = log::read(&path, &ReadOptions::default()).unwrap();
+        let robot = Robot::usual_for(log.format);
+        let thickness_m = |log: &Log| -> f64 {
+            let replayed = replay::run(log, &robot, SlamConfig::default(), || {}).unwrap();
+            let poses = parse_tum(&tum::render(replay::final_trajectory(&replayed.steps))).unwrap();
+            walls(log, &replayed, &poses).whole_m
+        };
+        let mut found_m: Vec<f64> = std::thread::scope(|threads| {
+            let noisy = (1..=4).map(|seed| perturbed(&log, &robot, 0.005, seed));
+            let drives: Vec<_> = noisy.map(|log| threads.spawn(move || thickness_m(&log))).collect();
+            std::iter::once(thickness_m(&log)).chain(drives.into_iter().map(|d| d.join().unwrap())).collect()
+        });
+        found_m.sort_by(f64::total_cmp);
+        println!("{name}: walls {found_m:.4?} m thick, the reference's {reference_m:.3} m");
+        assert!(found_m[2] <= thicker * reference_m, "walls of {name} are {found_m:.4?} m thick");
     }
 }
 

@@ -52,8 +52,10 @@ impl Build {
 /// Builds the firmware and returns its ELF file. The robot file is `robots/paper.toml` unless `LINESLAM_ROBOT` names one.
 pub fn build(build: Build) -> anyhow::Result<PathBuf> {
     ensure_target()?;
-    let mut command =
-        cargo(&format!("build --quiet --profile firmware -p firmware --target {TARGET} {}", build.features()));
+    let mut command = cargo(&format!(
+        "build --quiet --profile firmware -p firmware --target {TARGET} {}",
+        build.features()
+    ));
     if is_installed("flip-link") {
         // A stack that overflows then faults instead of writing over statics.
         command.args(["--config", &format!("target.{TARGET}.linker=\"flip-link\"")]);

@@ -25,6 +25,7 @@ use std::path::PathBuf;
 pub use discover::{Container, Found, find};
 pub use firmness::{Firmness, Noise};
 pub use measure::{ByReference, ByRelations, Measured, Poses, measure};
+pub use perturb::perturbed;
 pub use walls::{PASS_M, Walls, walls};
 
 /// Why there is nothing to measure.
