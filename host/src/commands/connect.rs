@@ -1,12 +1,14 @@
 //! `lineslam connect`.
 
-use std::io::{IsTerminal, Write, stderr, stdin};
+use std::io::{IsTerminal, Write, stderr, stdin, stdout};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use lineslam::emulated::{Board, Drive, Driven};
 use lineslam::link::from_robot::{Cause, Health, Hello, Pose, Status};
 use lineslam::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams, words};
+use lineslam::live::robot_source::{self, Emulated};
+use lineslam::live::screen;
 use lineslam::output::tum;
 use slam_core::geometry::pose::pose;
 
@@ -26,6 +28,9 @@ pub struct Args {
     /// Print the trajectory, a line of TUM format for each scan.
     #[arg(long)]
     tum: bool,
+    /// Print a line a second, also on a terminal, which otherwise shows a screen of it.
+    #[arg(long, conflicts_with = "tum")]
+    lines: bool,
     /// End after so many seconds.
     #[arg(long, value_name = "N")]
     seconds: Option<u64>,
@@ -178,6 +183,16 @@ fn watch(args: &Args, address: &Address, mut board: Option<&mut Board>) -> anyho
     let driven = board.as_ref().map(|board| board.drive());
     let is_over =
         || end.is_some_and(|end| Instant::now() >= end) || driven.as_ref().is_some_and(Driven::is_over);
+    if stdout().is_terminal() && !args.tum && !args.lines {
+        let source = match &args.emulate {
+            None => robot_source::start(address.clone())?,
+            Some(world) => robot_source::start_emulated(
+                address.clone(),
+                Emulated { title: format!("{world}, seed {}, emulated", args.seed), blueprint: Vec::new() },
+            )?,
+        };
+        return screen::show(source, is_over).context("the terminal");
+    }
     // The first time it must be there.
     let mut client = Some(Client::connect(address)?);
     let mut shown = Shown { tum: args.tum, ..Shown::default() };

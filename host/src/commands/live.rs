@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use lineslam::emulated::{Board, Drive};
 use lineslam::link::{Address, LinkError};
-use lineslam::live::browser;
 use lineslam::live::log_source::LogSource;
 use lineslam::live::robot_source::{self, Emulated};
 use lineslam::live::server::{Options, PORT, Server};
+use lineslam::live::{browser, foxglove};
 use lineslam::robot::Robot;
 use lineslam::sim::world::World;
 use lineslam::sim::{self, SimConfig, judge};
@@ -53,6 +53,9 @@ pub struct Args {
     /// A name by which other computers know this one; without it the page is to be opened by address.
     #[arg(long = "host", value_name = "NAME")]
     names: Vec<String>,
+    /// Also serve map, path, scan and pose for Foxglove, at ws://127.0.0.1:PORT.
+    #[arg(long, value_name = "PORT")]
+    foxglove: Option<u16>,
     /// Do not open the page in a browser.
     #[arg(long)]
     no_open: bool,
@@ -88,8 +91,20 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         (None, Some(world), _) => simulated(world, args)?.start()?,
         (None, None, None) => recorded(args.log.as_deref().context("no log")?, args)?.start()?,
     };
+    // It serves as long as this is there.
+    let (source, foxglove) = match args.foxglove {
+        None => (source, None),
+        Some(port) => {
+            let (source, server) = foxglove::tee(source, port)
+                .with_context(|| format!("--foxglove {port}: cannot serve at 127.0.0.1:{port}"))?;
+            (source, Some(server))
+        }
+    };
     let url = server.url();
     println!("{url}");
+    if let Some(foxglove) = &foxglove {
+        eprintln!("For Foxglove: ws://127.0.0.1:{}", foxglove.port());
+    }
     if server.is_open() {
         eprintln!(
             "warning: whoever reaches {} sees the map and can command the robot: there is no password. Without --listen only this \

@@ -250,6 +250,17 @@ pub struct Source {
     pub(super) orders: Orders,
 }
 
+impl Source {
+    /// The next event, where one has come. An error once there are no more.
+    pub fn try_next(&mut self) -> Result<Option<Event>, Closed> {
+        match self.events.try_recv() {
+            Ok(event) => Ok(Some(event)),
+            Err(mpsc::error::TryRecvError::Empty) => Ok(None),
+            Err(mpsc::error::TryRecvError::Disconnected) => Err(Closed),
+        }
+    }
+}
+
 /// The server has gone: a source ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("nobody listens any more")]

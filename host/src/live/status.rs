@@ -263,10 +263,10 @@ fn milliseconds(us: u32) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn well() -> Status {
+    pub fn well() -> Status {
         Status {
             state: TrackingState::Tracking,
             mapping: true,
