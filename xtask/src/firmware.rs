@@ -52,16 +52,14 @@ impl Build {
 /// Builds the firmware and returns its ELF file. The robot file is `robots/paper.toml` unless `LINESLAM_ROBOT` names one.
 pub fn build(build: Build) -> anyhow::Result<PathBuf> {
     ensure_target()?;
-    let mut command = cargo(&format!(
-        "build --quiet --profile firmware -p firmware --target {TARGET} {}",
-        build.features()
-    ));
+    let mut command =
+        cargo(&format!("build --quiet --release -p firmware --target {TARGET} {}", build.features()));
     if is_installed("flip-link") {
         // A stack that overflows then faults instead of writing over statics.
         command.args(["--config", &format!("target.{TARGET}.linker=\"flip-link\"")]);
     }
     step(&format!("firmware {}", build.name()), &mut command)?;
-    let made = target_folder().join(TARGET).join("firmware/firmware");
+    let made = target_folder().join(TARGET).join("release/firmware");
     let kept = target_folder().join(ELF_FOLDER).join(format!("{}.elf", build.name()));
     std::fs::create_dir_all(target_folder().join(ELF_FOLDER)).context("the folder for ELF files")?;
     std::fs::copy(&made, &kept).with_context(|| made.display().to_string())?;
@@ -132,10 +130,10 @@ pub fn bench_output() -> anyhow::Result<String> {
 fn bench_command() -> anyhow::Result<std::process::Command> {
     ensure_target()?;
     let set = fixed_set()?;
-    let command = format!("build --quiet --profile firmware -p bench-target --target {TARGET}");
+    let command = format!("build --quiet --release -p bench-target --target {TARGET}");
     step("benchmark firmware", cargo(&command).env(FIXED_SET, set))?;
     let mut command = program(target_folder().join("checked/bench"));
-    command.arg("--firmware").arg(target_folder().join(TARGET).join("firmware/bench-target"));
+    command.arg("--firmware").arg(target_folder().join(TARGET).join("release/bench-target"));
     Ok(command)
 }
 

@@ -12,7 +12,7 @@ use crate::run::{announce, cargo, step, target_folder};
 
 /// Flash that the firmware may take: code, constants, and what variables begin with. The part has 2048 KiB; the budget is there to
 /// have growth noticed.
-const FLASH_BUDGET: u64 = 240 * 1024;
+const FLASH_BUDGET: u64 = 244 * 1024;
 /// RAM that it may take, the map among it, less the stack, which is measured as it runs: a test of the emulated board holds both together
 /// to 190 KiB of 192.
 const RAM_BUDGET: u64 = (190 - STACK_KIB) * 1024;
@@ -57,9 +57,9 @@ pub fn report() -> anyhow::Result<()> {
         println!("{bytes:>9} {name}");
     }
 
-    let command = format!("build --quiet --profile firmware -p footprint --target {TARGET}");
+    let command = format!("build --quiet --release -p footprint --target {TARGET}");
     step("size of the sensor's driver alone, bytes", &mut cargo(&command))?;
-    let driver = read(&target_folder().join(TARGET).join("firmware/footprint"))?;
+    let driver = read(&target_folder().join(TARGET).join("release/footprint"))?;
     for (name, bytes) in largest(&driver.code_by_crate) {
         println!("{bytes:>9} of code in {name}");
     }
