@@ -116,13 +116,17 @@ impl Counted {
     }
 }
 
-/// Runs the firmware on both cores.
+/// Runs the firmware on both cores, side by side; shows the log of the first.
 pub fn run(path: &Path, show: bool) -> anyhow::Result<Report> {
     let elf = std::fs::read(path).with_context(|| path.display().to_string())?;
     let pace = Pace::new(Program::read(&elf, path)?);
-    let instructions = measure(path, elf.clone(), show, None)?;
-    let cycles = measure(path, elf, show, Some(&pace))?;
-    Ok(Report { instructions, cycles, pace })
+    let copy = elf.clone();
+    let (instructions, cycles) = std::thread::scope(|threads| {
+        let instructions = threads.spawn(|| measure(path, copy, show, None));
+        let cycles = measure(path, elf, false, Some(&pace));
+        (instructions.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)), cycles)
+    });
+    Ok(Report { instructions: instructions?, cycles: cycles?, pace })
 }
 
 /// Runs it to its end; with a pace until the default configuration is measured.

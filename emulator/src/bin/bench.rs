@@ -14,7 +14,7 @@ struct Cli {
     /// The benchmark firmware.
     #[arg(long, value_name = "ELF")]
     firmware: PathBuf,
-    /// Print the firmware's log as it comes.
+    /// Print the firmware's log as it comes, of the core of one cycle.
     #[arg(long)]
     log: bool,
 }
