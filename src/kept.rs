@@ -21,8 +21,8 @@ pub const ROOM: [usize; 2] = [slam_core::capacity::SEGMENTS, slam_core::capacity
 /// … or less, on parts with 128 KiB of RAM.
 #[cfg(feature = "small")]
 pub const ROOM: [usize; 2] = [448, 96];
-/// Odometry samples there is room for: 0.32 s.
-pub const SAMPLES: usize = 64;
+/// Odometry samples there is room for.
+pub const SAMPLES: usize = slam_core::capacity::SAMPLES;
 
 /// The map, the pose and the odometry.
 pub type Mapper = slam_core::Mapper<{ ROOM[0] }, SAMPLES, BEAMS, { ROOM[1] }>;

@@ -7,7 +7,7 @@ use lineslam::sim::world::World;
 use lineslam::sim::{Drive, UnitErrors};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::Serialize;
-use slam_core::capacity::{PLACES, SEGMENTS};
+use slam_core::capacity::{PLACES, SAMPLES, SEGMENTS};
 use slam_core::geometry::pose::pose;
 use slam_core::odometry::Integration;
 use slam_core::sensor::scan::Reading;
@@ -279,7 +279,7 @@ pub fn replayed(entries: &[Entry], robot: &Robot) -> anyhow::Result<Box<Firmware
 }
 
 /// The sizes of `src/kept.rs`.
-pub type FirmwareMapper = Mapper<SEGMENTS, 64, 682, PLACES>;
+pub type FirmwareMapper = Mapper<SEGMENTS, SAMPLES, 682, PLACES>;
 
 fn mapper(robot: &Robot) -> anyhow::Result<Box<FirmwareMapper>> {
     let drive = robot.drive().ok_or_else(|| anyhow::anyhow!("robot '{}' has no wheels", robot.name))?;

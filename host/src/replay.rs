@@ -6,11 +6,10 @@ mod run;
 use std::time::Duration;
 
 pub use follow::Agreement;
-use follow::ROBOT_TRACK;
 use nalgebra::Isometry2;
 use run::TRACK;
 pub use run::{Run, Taken};
-use slam_core::capacity::{PLACES, SEGMENTS};
+use slam_core::capacity::{PLACES, SAMPLES, SEGMENTS};
 use slam_core::config::ConfigError;
 use slam_core::map::{MapCounters, MapSegment};
 use slam_core::odometry::delay::Delay;
@@ -149,7 +148,7 @@ pub fn run_from(
 ) -> Result<Replay, ReplayError> {
     match run::beams(log) {
         ..=URG_BEAMS if start.follows && log.course.is_some() => {
-            run_sized::<URG_BEAMS, ROBOT_TRACK>(start, log, robot, config, progress)
+            run_sized::<URG_BEAMS, SAMPLES>(start, log, robot, config, progress)
         }
         ..=URG_BEAMS => run_sized::<URG_BEAMS, TRACK>(start, log, robot, config, progress),
         beams if beams <= MANY_BEAMS => run_sized::<MANY_BEAMS, TRACK>(start, log, robot, config, progress),

@@ -4,3 +4,5 @@
 pub const SEGMENTS: usize = 1024;
 /// Places.
 pub const PLACES: usize = 256;
+/// Samples of the odometry: 0.32 s of the firmware's. They decide when an older motion is taken together, and with that the last bits.
+pub const SAMPLES: usize = 64;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Context, bail};
 use indicatif::{HumanBytes, ProgressBar, ProgressStyle};
 use lineslam::link::from_robot::Cause;
-use lineslam::link::{Address, Client, Command, FromRobot, LinkError, Streams, words};
+use lineslam::link::{Address, Client, Command, FromRobot, GREETING, LinkError, Streams, words};
 use lineslam::recording::{RecordError, Recorder, STREAMS, Summary};
 
 use super::common::terminal;
@@ -36,8 +36,6 @@ pub struct Args {
     seconds: Option<u64>,
 }
 
-/// The robot says who it is within this.
-const GREETING: Duration = Duration::from_secs(4);
 /// It is asked again this often, so that one that was reset unheard is asked for its streams again.
 const ASK: Duration = Duration::from_secs(2);
 /// A port that is gone is tried again this often.
@@ -83,22 +81,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 /// Asks until the robot answers. What it said meanwhile.
 fn greet(client: &mut Client) -> Result<Vec<FromRobot>, LinkError> {
-    let begun = Instant::now();
-    let mut heard = Vec::new();
-    while begun.elapsed() < GREETING {
-        client.send(Command::Subscribe(STREAMS))?;
-        client.send(Command::Hello)?;
-        let asked = Instant::now();
-        while asked.elapsed() < RETRY {
-            let Some(message) = client.next(LISTEN)? else { continue };
-            let is_hello = matches!(message, FromRobot::Hello(_));
-            heard.push(message);
-            if is_hello {
-                return Ok(heard);
-            }
-        }
-    }
-    Err(LinkError::NoAnswer { address: client.address().clone(), waited: GREETING })
+    let (hello, mut heard) = client.greet(STREAMS, GREETING)?;
+    heard.push(FromRobot::Hello(hello));
+    Ok(heard)
 }
 
 /// Has the robot begin a new map. The pose from which on it has one: what it said before is of no use.

@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 
 use ::link::frame::ReceiveCounters;
 pub use ::link::from_robot;
-use ::link::from_robot::{Answer, Outcome};
+use ::link::from_robot::{Answer, Hello, Outcome};
 use ::link::{BIT_RATE, FRAME, Receiver, Request, Sender};
 pub use ::link::{Command, FromRobot, Streams};
 pub use address::Address;
@@ -77,6 +77,10 @@ pub enum LinkError {
 const AGAIN: Duration = Duration::from_millis(400);
 /// … and given up after this.
 const GIVEN_UP: Duration = Duration::from_secs(4);
+/// A robot says who it is within this.
+pub const GREETING: Duration = Duration::from_secs(4);
+/// It is asked again this often.
+const GREET_AGAIN: Duration = Duration::from_millis(500);
 /// A read takes no longer than this.
 const READ: Duration = Duration::from_millis(20);
 
@@ -194,6 +198,29 @@ impl Client {
         self.id = self.id.wrapping_add(1);
         self.put(Request { id, command })?;
         Ok(id)
+    }
+
+    /// Asks for these streams and who is there, until the robot says it. That, and what else it said meanwhile, in order.
+    pub fn greet(
+        &mut self,
+        streams: Streams,
+        within: Duration,
+    ) -> Result<(Hello, Vec<FromRobot>), LinkError> {
+        let begun = Instant::now();
+        let mut heard = Vec::new();
+        while begun.elapsed() < within {
+            self.send(Command::Subscribe(streams))?;
+            self.send(Command::Hello)?;
+            let asked = Instant::now();
+            while asked.elapsed() < GREET_AGAIN {
+                match self.next(READ)? {
+                    Some(FromRobot::Hello(hello)) => return Ok((hello, heard)),
+                    Some(message) => heard.push(message),
+                    None => {}
+                }
+            }
+        }
+        Err(LinkError::NoAnswer { address: self.address.clone(), waited: within })
     }
 
     fn put(&mut self, request: Request) -> Result<(), LinkError> {

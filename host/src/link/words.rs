@@ -1,6 +1,7 @@
 //! What the robot says, in words.
 
 use slam_core::odometry::wheel_faults::WheelFault;
+use slam_core::tracking::TrackingState;
 
 use super::from_robot::{self, Event, Outcome, State};
 
@@ -35,13 +36,18 @@ pub fn fault_of(fault: from_robot::WheelFault) -> WheelFault {
     }
 }
 
+/// How far the pose is to be relied on, as the core knows it.
+pub fn state_of(state: State) -> TrackingState {
+    match state {
+        State::Tracking => TrackingState::Tracking,
+        State::Uncertain => TrackingState::Uncertain,
+        State::Lost => TrackingState::Lost,
+    }
+}
+
 /// How far the pose is to be relied on.
 pub fn of_state(state: State) -> &'static str {
-    match state {
-        State::Tracking => "tracking",
-        State::Uncertain => "uncertain",
-        State::Lost => "lost",
-    }
+    state_of(state).name()
 }
 
 /// Why a request was not carried out; none where it was.

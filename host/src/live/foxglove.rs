@@ -21,10 +21,8 @@ use foxglove::{Channel, ChannelBuilder, Context, FoxgloveError, WebSocketServer,
 
 use super::source::{Closed, Event, Line, Pose as RobotPose, Scan, Source, What, channel};
 use super::trail::Trail;
+use crate::output::mcap::{BASE, MAP};
 
-/// Frames, as REP 105 has them.
-const MAP: &str = "map";
-const BASE: &str = "base";
 /// Width of what is drawn, pixels.
 const WALL_PX: f64 = 3.0;
 const THIN_PX: f64 = 1.0;
@@ -93,18 +91,18 @@ impl Shown {
             What::Lines { changed, removed } => {
                 self.lines.extend(changed.iter().map(|line| (line.id, *line)));
                 self.lines.retain(|id, _| !removed.contains(id));
-                self.map.log(&self.map_scene(at));
+                self.tell_map(at);
             }
             What::Path(points) => self.path_points.replace(points.iter().map(|point| point.at)),
             What::Began | What::Forgotten => {
                 self.lines.clear();
                 self.path_points = Trail::default();
-                self.map.log(&self.map_scene(at));
+                self.tell_map(at);
             }
             // Once a second, for who has come since.
             What::Status(_) => {
-                self.map.log(&self.map_scene(at));
-                self.path.log(&self.path_scene(at));
+                self.tell_map(at);
+                self.tell_path(at);
             }
             What::Places(_) | What::Note(_) | What::Playback(_) => {}
         }
@@ -123,6 +121,19 @@ impl Shown {
             translation: Some(position),
             rotation: Some(orientation),
         });
+    }
+
+    /// Whole scenes are not put together for nobody.
+    fn tell_map(&self, at: Timestamp) {
+        if self.map.has_sinks() {
+            self.map.log(&self.map_scene(at));
+        }
+    }
+
+    fn tell_path(&self, at: Timestamp) {
+        if self.path.has_sinks() {
+            self.path.log(&self.path_scene(at));
+        }
     }
 
     fn map_scene(&self, at: Timestamp) -> SceneUpdate {

@@ -13,13 +13,11 @@ use super::source::{
     About, Answer, Closed, Command as Asked, Feed, Kind, Line, Note, Order, Source, Weight, What, channel,
 };
 use crate::link::from_robot::{Cause, Event, Hello, KeptMap, Outcome};
-use crate::link::{Address, Client, Command, FromRobot, LinkError, MapCopy, Streams, words};
+use crate::link::{Address, Client, Command, FromRobot, GREETING, LinkError, MapCopy, Streams, words};
 use crate::sim::world::Edge;
 use scan::Scans;
 use telling::Health;
 
-/// A robot says who it is within this.
-const GREETING: Duration = Duration::from_secs(4);
 /// An emulated one may be slow to boot on a busy computer.
 const EMULATED_GREETING: Duration = Duration::from_secs(30);
 /// Messages are waited for no longer than this, so that orders are not late.
@@ -75,22 +73,12 @@ fn begin(address: Address, emulated: Option<Emulated>) -> Result<Source, LinkErr
 }
 
 fn greet(client: &mut Client, within: Duration) -> Result<Hello, LinkError> {
-    client.send(Command::Subscribe(STREAMS))?;
-    let begun = Instant::now();
-    while begun.elapsed() < within {
-        client.send(Command::Hello)?;
-        let asked = Instant::now();
-        while asked.elapsed() < RETRY {
-            if let Some(FromRobot::Hello(hello)) = client.next(LISTEN)? {
-                // It may have booted since.
-                subscribe(client, &hello)?;
-                // What came before is passed over; the map is to come whole.
-                client.send(Command::SendMap { blocks: u32::MAX, places: true })?;
-                return Ok(hello);
-            }
-        }
-    }
-    Err(LinkError::NoAnswer { address: client.address().clone(), waited: within })
+    // What came before is passed over; the map is to come whole.
+    let (hello, _) = client.greet(STREAMS, within)?;
+    // It may have booted since.
+    subscribe(client, &hello)?;
+    client.send(Command::SendMap { blocks: u32::MAX, places: true })?;
+    Ok(hello)
 }
 
 /// A robot that was reset sends no more than the usual again.

@@ -51,6 +51,8 @@ pub fn show(mut source: Source, is_over: impl Fn() -> bool) -> io::Result<()> {
     let mut screen = Screen::new(source.about.clone());
     let mut terminal = ratatui::try_init()?;
     let shown = (|| {
+        // Not every terminal has another screen to begin with.
+        terminal.clear()?;
         while !is_over() {
             loop {
                 match source.try_next() {
@@ -208,13 +210,11 @@ impl Screen {
         let Some(pose) = &self.pose else { return vec!["Nothing has been heard of it yet.".into()] };
         let [x, y, heading] = pose.at;
         let [xx, _, _, yy, _, turn] = pose.covariance.map(|v| v.max(0.0));
-        let state = match pose.state {
-            TrackingState::Tracking => "tracking",
-            TrackingState::Uncertain => "uncertain",
-            TrackingState::Lost => "lost",
-        };
         let mut facts = vec![
-            Text::styled(state, Style::new().fg(color_of(pose.state)).add_modifier(Modifier::BOLD)),
+            Text::styled(
+                pose.state.name(),
+                Style::new().fg(color_of(pose.state)).add_modifier(Modifier::BOLD),
+            ),
             fact("x, y", format!("{x:.3}, {y:.3} ± {:.3} m", (xx + yy).sqrt())),
             fact("Heading", format!("{:.1} ± {:.2}°", heading.to_degrees(), turn.sqrt().to_degrees())),
         ];

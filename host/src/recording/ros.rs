@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use nalgebra::Isometry2;
 use slam_core::geometry::pose::pose;
-use slam_core::sensor::scan::RangeCodes;
+use slam_core::sensor::scan::{Mounting, RangeCodes};
 
 use super::course::RobotScan;
 use crate::link::from_robot::{Hello, Pose as Said, Scanner};
@@ -12,8 +12,8 @@ use crate::output::mcap::file::header;
 use crate::output::mcap::messages::{
     Covariance, LaserScan, Pose, PoseWithCovariance, PoseWithCovarianceStamped, TfMessage, TransformStamped,
 };
-use crate::output::mcap::scan::{LASER, metres, range_m};
-use crate::output::mcap::{BASE, MAP, exact};
+use crate::output::mcap::scan::{LASER, base_from_laser, metres, range_m};
+use crate::output::mcap::{BASE, MAP};
 use crate::robot::{StatedGeometry, Wheels};
 
 /// How the robot's beams lie, with a revolution of this long.
@@ -75,11 +75,8 @@ pub fn scan<'a>(scanner: &Scanner, scan: &RobotScan, ns: u64) -> LaserScan<'a> {
 /// Where the scanner is on the robot.
 pub fn mounting<'a>(scanner: &Scanner, ns: u64) -> TfMessage<'a> {
     let [x, y, heading] = scanner.base_from_laser;
-    let upright = Pose::of(&exact(&pose(x, y, heading)));
-    let transform = if scanner.upside_down { upright.head_down() } else { upright };
-    TfMessage {
-        transforms: vec![TransformStamped { header: header(ns, BASE), child_frame_id: LASER, transform }],
-    }
+    let mounting = Mounting { base_from_laser: pose(x, y, heading), upside_down: scanner.upside_down };
+    TfMessage { transforms: vec![base_from_laser(&mounting, LASER, ns)] }
 }
 
 fn map_from_base(said: &Said) -> Isometry2<f64> {

@@ -8,15 +8,12 @@ use std::time::Instant;
 use serde::Serialize;
 use slam_core::capacity::{PLACES, SEGMENTS};
 use slam_core::geometry::pose::{components, pose};
-use slam_core::tracking::TrackingState;
 use slam_core::{Mapper, ScanMotion, SlamUpdate};
 
-use crate::link::from_robot::{Cause, KeptMap, Pose, State};
+use crate::link::from_robot::{Cause, KeptMap, Pose};
+use crate::link::words;
 use crate::log::Course;
 use crate::recording::course::{Act, Step};
-
-/// Samples that the robot holds, which decide when it takes an older motion together.
-pub const ROBOT_TRACK: usize = 64;
 
 /// How the poses that were computed here compare with those that the robot said, to the last bit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -164,20 +161,12 @@ impl<'a> Follower<'a> {
         let here: [f32; 3] = components(&slam.pose()).into();
         let is_same = here.map(f32::to_bits) == said.pose.map(f32::to_bits)
             && slam.map().segments().len() == usize::from(said.lines)
-            && state_of(slam.state()) == said.state;
+            && slam.state() == words::state_of(said.state);
         if is_same {
             self.agreement.same += 1;
         } else {
             self.agreement.different += 1;
             self.agreement.first_different.get_or_insert(said.number);
         }
-    }
-}
-
-fn state_of(state: TrackingState) -> State {
-    match state {
-        TrackingState::Tracking => State::Tracking,
-        TrackingState::Uncertain => State::Uncertain,
-        TrackingState::Lost => State::Lost,
     }
 }

@@ -11,13 +11,13 @@ use lineslam::sim::{SimConfig, drive};
 use link::from_robot::*;
 use link::ranges::{Packed, RANGES};
 use link::{FromRobot, Streams};
-use slam_core::capacity::{PLACES, SEGMENTS};
+use slam_core::capacity::{PLACES, SAMPLES, SEGMENTS};
 use slam_core::geometry::pose::{components, pose};
 use slam_core::tracking::TrackingState;
 use slam_core::{Mapper, WheelTicks};
 
 /// The firmware's.
-type Firmware = Mapper<SEGMENTS, 64, 682, PLACES>;
+type Firmware = Mapper<SEGMENTS, SAMPLES, 682, PLACES>;
 
 pub fn robot_file() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../robots/paper.toml")

@@ -4,7 +4,6 @@ use slam_core::map::MapCounters;
 use slam_core::mapper::MapperCounters;
 use slam_core::odometry::delay::Delay;
 use slam_core::slam::Counters;
-use slam_core::tracking::TrackingState;
 
 use crate::link::from_robot::{self, Event, Hello, State};
 use crate::link::{Client, MapCopy, words};
@@ -13,15 +12,7 @@ use crate::live::status::{Counter, Status, Troubles};
 
 /// A pose.
 pub(super) fn pose_of(said: &from_robot::Pose) -> Pose {
-    Pose { at: said.pose, covariance: said.covariance, state: state_of(said.state) }
-}
-
-fn state_of(state: State) -> TrackingState {
-    match state {
-        State::Tracking => TrackingState::Tracking,
-        State::Uncertain => TrackingState::Uncertain,
-        State::Lost => TrackingState::Lost,
-    }
+    Pose { at: said.pose, covariance: said.covariance, state: words::state_of(said.state) }
 }
 
 /// A line of the map in a slot.
@@ -120,7 +111,7 @@ impl Health {
     pub fn whole(&self) -> Option<Status> {
         let (said, health) = (self.status.as_ref()?, self.health.as_ref()?);
         Some(Status {
-            state: state_of(self.state),
+            state: words::state_of(self.state),
             mapping: said.mapping,
             support: None,
             scans_per_s: if said.sensor { self.scans_per_s } else { 0.0 },

@@ -45,13 +45,16 @@ impl Frames {
 
     /// From `base_link` to each of them.
     pub fn message(&self, ns: u64) -> TfMessage<'_> {
-        let transforms = self.mountings.iter().map(|(mounting, name)| {
-            let upright = Pose::of(&exact(&mounting.base_from_laser));
-            let transform = if mounting.upside_down { upright.head_down() } else { upright };
-            TransformStamped { header: header(ns, BASE), child_frame_id: name, transform }
-        });
+        let transforms = self.mountings.iter().map(|(mounting, name)| base_from_laser(mounting, name, ns));
         TfMessage { transforms: transforms.collect() }
     }
+}
+
+/// From `base_link` to a scanner's frame.
+pub(crate) fn base_from_laser<'a>(mounting: &Mounting, frame: &'a str, ns: u64) -> TransformStamped<'a> {
+    let upright = Pose::of(&exact(&mounting.base_from_laser));
+    let transform = if mounting.upside_down { upright.head_down() } else { upright };
+    TransformStamped { header: header(ns, BASE), child_frame_id: frame, transform }
 }
 
 /// Instant of a scan's first beam. A log that begins at zero has no earlier one.
